@@ -1,0 +1,1 @@
+"""The inverse problem: SMP distribution and forces for a wanted temporary shape."""

@@ -1,0 +1,1 @@
+"""Finite elements and hyperelastic energies: value, gradient, tangent."""

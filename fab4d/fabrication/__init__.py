@@ -1,0 +1,1 @@
+"""From an SMP density per tet to labels and watertight bodies that can be printed."""

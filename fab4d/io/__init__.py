@@ -1,0 +1,1 @@
+"""Formats: scenes, cards, meshes, STL, 3MF, VTU."""

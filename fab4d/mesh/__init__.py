@@ -1,0 +1,1 @@
+"""Tet meshes as plain arrays: topology, measures, quality. No files, no physics."""

@@ -1,0 +1,1 @@
+"""Metrics, plots, rig sheet and report page."""

@@ -1,0 +1,1 @@
+"""From forces to what a person sets up: patches, directions, schedule."""

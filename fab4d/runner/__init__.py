@@ -1,0 +1,1 @@
+"""Order, artifacts on disk, resuming, leaving out."""

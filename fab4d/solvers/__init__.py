@@ -1,0 +1,1 @@
+"""Linear and nonlinear solvers that know arrays and callables only."""

@@ -1,0 +1,1 @@
+"""One module and one `run` per stage of pipeline/stages.toml; each composes the rooms below."""
