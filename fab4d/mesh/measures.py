@@ -23,7 +23,7 @@ def face_area_vectors(X: FloatArray, faces: IntArray) -> FloatArray:
 def vertex_areas(X: FloatArray, faces: IntArray) -> FloatArray:
     """A third of the area of the triangles `faces` at each vertex, (n,), mm^2; zero off the surface."""
     areas = np.linalg.norm(face_area_vectors(X, faces), axis=1)
-    return np.bincount(faces.ravel(), np.repeat(areas / 3.0, 3), minlength=len(X))
+    return np.bincount(faces.ravel(), np.repeat(areas / 3.0, 3), minlength=len(X)).astype(np.float64)
 
 
 def bounding_box_diagonal(X: FloatArray) -> float:

@@ -11,8 +11,8 @@ BoolArray = NDArray[np.bool_]
 
 
 def frozen(array: NDArray, dtype: type) -> NDArray:
-    """`array` as a contiguous read-only array of `dtype` (a copy when it was writeable)."""
-    result = np.array(array, dtype=dtype, order="C", copy=True)
+    """`array` as a contiguous read-only array of `dtype`."""
+    result: NDArray = np.array(array, dtype=dtype, order="C", copy=True)
     result.setflags(write=False)
     return result
 
@@ -30,7 +30,7 @@ class TetMesh:
         if self.X.ndim != 2 or self.X.shape[1] != 3 or self.tets.ndim != 2 or self.tets.shape[1] != 4:
             msg = f"a tet mesh needs X (n, 3) and tets (m, 4), not {self.X.shape} and {self.tets.shape}"
             raise ValueError(msg)
-        if len(self.tets) and not (0 <= self.tets.min() and self.tets.max() < len(self.X)):
+        if len(self.tets) and not (self.tets.min() >= 0 and self.tets.max() < len(self.X)):
             msg = f"tet vertex index out of range 0..{len(self.X) - 1}"
             raise ValueError(msg)
 
