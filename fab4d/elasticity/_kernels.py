@@ -1,0 +1,256 @@
+"""Compiled element loops of the neo-Hookean solid (model.md section 2).
+
+All of them take elements (m, nn), shape-function gradients dN (m, nq, nn, 3), weights (m, nq), moduli mu, kappa (m,) and
+nodal displacements u (N, 3) from the shape that dN belongs to. An element of zero modulus mu is skipped. Everything is
+evaluated with H = F - I, because the glassy phase works at strains where det F - 1 would lose its digits.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+_INVERTED = -1.0
+
+
+@njit(cache=True, inline="always")
+def _displacement_gradient(u, nodes, dN, H):
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = 0.0
+    for a in range(nodes.shape[0]):
+        node = nodes[a]
+        for i in range(3):
+            for j in range(3):
+                H[i, j] += u[node, i] * dN[a, j]
+
+
+@njit(cache=True, inline="always")
+def _invariants(H, C):
+    """Writes C = J F^-T - I = tr(H) I - H^T + cof H; returns J - 1 and e = I1/3 - 1."""
+    trace = H[0, 0] + H[1, 1] + H[2, 2]
+    C[0, 0] = H[1, 1] * H[2, 2] - H[1, 2] * H[2, 1]
+    C[0, 1] = H[1, 2] * H[2, 0] - H[1, 0] * H[2, 2]
+    C[0, 2] = H[1, 0] * H[2, 1] - H[1, 1] * H[2, 0]
+    C[1, 0] = H[0, 2] * H[2, 1] - H[0, 1] * H[2, 2]
+    C[1, 1] = H[0, 0] * H[2, 2] - H[0, 2] * H[2, 0]
+    C[1, 2] = H[0, 1] * H[2, 0] - H[0, 0] * H[2, 1]
+    C[2, 0] = H[0, 1] * H[1, 2] - H[0, 2] * H[1, 1]
+    C[2, 1] = H[0, 2] * H[1, 0] - H[0, 0] * H[1, 2]
+    C[2, 2] = H[0, 0] * H[1, 1] - H[0, 1] * H[1, 0]
+    det = H[0, 0] * C[0, 0] + H[0, 1] * C[0, 1] + H[0, 2] * C[0, 2]
+    jm1 = trace + C[0, 0] + C[1, 1] + C[2, 2] + det
+    square = 0.0
+    for i in range(3):
+        C[i, i] += trace
+        for j in range(3):
+            square += H[i, j] * H[i, j]
+            C[i, j] -= H[j, i]
+    return jm1, (2.0 * trace + square) / 3.0
+
+
+@njit(cache=True, inline="always")
+def _density(jm1, e, mu, kappa):
+    t = -2.0 / 3.0 * math.log1p(jm1)
+    return 1.5 * mu * (math.expm1(t) * (1.0 + e) + e) + 0.5 * kappa * jm1 * jm1
+
+
+@njit(cache=True, inline="always")
+def _stress(H, C, jm1, e, mu, kappa, P):
+    """First Piola-Kirchhoff stress, with the identity parts cancelled by hand."""
+    J = 1.0 + jm1
+    m = mu * math.exp(-2.0 / 3.0 * math.log1p(jm1)) / J
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = m * (J * H[i, j] - (1.0 + e) * C[i, j]) + kappa * jm1 * C[i, j]
+        P[i, i] += m * (jm1 - e) + kappa * jm1
+
+
+@njit(cache=True)
+def energy(elements, dN, weights, mu, kappa, u):
+    """Strain energy and the smallest det F; (inf, det F) as soon as an element is inverted."""
+    H, C = np.zeros((3, 3)), np.zeros((3, 3))
+    total, smallest = 0.0, np.inf
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            smallest = min(smallest, 1.0 + jm1)
+            if not jm1 > _INVERTED:
+                return np.inf, smallest
+            total += weights[m, q] * _density(jm1, e, mu[m], kappa[m])
+    return total, smallest
+
+
+@njit(cache=True)
+def gradient(elements, dN, weights, mu, kappa, u, g):
+    """Adds the nodal forces dW/du to g (N, 3); returns as `energy`."""
+    H, C, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    total, smallest = 0.0, np.inf
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            smallest = min(smallest, 1.0 + jm1)
+            if not jm1 > _INVERTED:
+                return np.inf, smallest
+            w = weights[m, q]
+            total += w * _density(jm1, e, mu[m], kappa[m])
+            _stress(H, C, jm1, e, mu[m], kappa[m], P)
+            for a in range(elements.shape[1]):
+                node = elements[m, a]
+                for i in range(3):
+                    g[node, i] += w * (P[i, 0] * dN[m, q, a, 0] + P[i, 1] * dN[m, q, a, 1] + P[i, 2] * dN[m, q, a, 2])
+    return total, smallest
+
+
+@njit(cache=True)
+def element_forces(elements, dN, weights, mu, kappa, u, out):
+    """Adds the nodal forces of each element to out (m, nn, 3); all elements must have det F > 0."""
+    H, C, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            _stress(H, C, jm1, e, mu[m], kappa[m], P)
+            for a in range(elements.shape[1]):
+                for i in range(3):
+                    for j in range(3):
+                        out[m, a, i] += weights[m, q] * P[i, j] * dN[m, q, a, j]
+
+
+@njit(cache=True, inline="always")
+def _tangent_vectors(H, C, jm1, dN, f, g):
+    """f_a = F dN_a and g_a = F^-T dN_a of all nodes."""
+    J = 1.0 + jm1
+    for a in range(dN.shape[0]):
+        for i in range(3):
+            f[a, i] = dN[a, i] + H[i, 0] * dN[a, 0] + H[i, 1] * dN[a, 1] + H[i, 2] * dN[a, 2]
+            g[a, i] = (dN[a, i] + C[i, 0] * dN[a, 0] + C[i, 1] * dN[a, 1] + C[i, 2] * dN[a, 2]) / J
+
+
+@njit(cache=True, inline="always")
+def _tangent_scalars(jm1, e, mu, kappa, w):
+    """Factors of: delta_ik dN_a.dN_b, f_a g_b + g_a f_b, g_a,i g_b,k, g_b,i g_a,k (from dP[H] with H = e_k (x) dN_b)."""
+    J = 1.0 + jm1
+    m = w * mu * math.exp(-2.0 / 3.0 * math.log1p(jm1))
+    return (
+        m,
+        -2.0 / 3.0 * m,
+        2.0 / 3.0 * m * (1.0 + e) + w * kappa * (2.0 * J - 1.0) * J,
+        m * (1.0 + e) - w * kappa * jm1 * J,
+    )
+
+
+@njit(cache=True)
+def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
+    """Adds the tangent stiffness to `data`, the lower triangle in the CSC form of pattern.SymmetricPattern."""
+    nn = elements.shape[1]
+    H, C = np.zeros((3, 3)), np.zeros((3, 3))
+    f, g = np.zeros((nn, 3)), np.zeros((nn, 3))
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            _tangent_vectors(H, C, jm1, dN[m, q], f, g)
+            s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], weights[m, q])
+            pair = 0
+            for a0 in range(nn):
+                for b0 in range(a0 + 1):
+                    a, b = a0, b0
+                    if elements[m, a] < elements[m, b]:
+                        a, b = b0, a0
+                    column = 3 * elements[m, b]
+                    dot = s0 * (
+                        dN[m, q, a, 0] * dN[m, q, b, 0]
+                        + dN[m, q, a, 1] * dN[m, q, b, 1]
+                        + dN[m, q, a, 2] * dN[m, q, b, 2]
+                    )
+                    r = rank[m, pair]
+                    for k in range(3):
+                        if r < 0:
+                            base, start = indptr[column + k] - k, k
+                        else:
+                            base, start = indptr[column + k] + 3 - k + 3 * r, 0
+                        pb, pa = s1 * f[b, k] + s2 * g[b, k], s1 * g[b, k]
+                        qa = s3 * g[a, k]
+                        for i in range(start, 3):
+                            value = pb * g[a, i] + pa * f[a, i] + qa * g[b, i]
+                            if i == k:
+                                value += dot
+                            data[base + i] += value
+                    pair += 1
+
+
+@njit(cache=True)
+def mixed(elements, dN, weights, mu, kappa, u, blocks):
+    """Adds d(nodal forces)/dx of the glassy term to blocks (m, nn, nn, 3, 3); dN belongs to x, and u = y - x.
+
+    With Fg = F_y F_x^-1 the block (a, b) is -K_ab Fg - w (P dN_b) (x) dN_a: model.md section 2, d/dF_x contracted with
+    the shape functions.
+    """
+    nn = elements.shape[1]
+    H, C, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    f, g = np.zeros((nn, 3)), np.zeros((nn, 3))
+    block, Pg = np.zeros((3, 3)), np.zeros(3)
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            w = weights[m, q]
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            _stress(H, C, jm1, e, mu[m], kappa[m], P)
+            _tangent_vectors(H, C, jm1, dN[m, q], f, g)
+            s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], w)
+            for a in range(nn):
+                for b in range(nn):
+                    dot = s0 * (
+                        dN[m, q, a, 0] * dN[m, q, b, 0]
+                        + dN[m, q, a, 1] * dN[m, q, b, 1]
+                        + dN[m, q, a, 2] * dN[m, q, b, 2]
+                    )
+                    for i in range(3):
+                        Pg[i] = w * (P[i, 0] * dN[m, q, b, 0] + P[i, 1] * dN[m, q, b, 1] + P[i, 2] * dN[m, q, b, 2])
+                        for k in range(3):
+                            block[i, k] = (
+                                s1 * (f[b, k] * g[a, i] + g[b, k] * f[a, i])
+                                + s2 * g[a, i] * g[b, k]
+                                + s3 * g[b, i] * g[a, k]
+                            )
+                        block[i, i] += dot
+                    for i in range(3):
+                        for k in range(3):
+                            blocks[m, a, b, i, k] -= (
+                                block[i, k]
+                                + block[i, 0] * H[0, k]
+                                + block[i, 1] * H[1, k]
+                                + block[i, 2] * H[2, k]
+                                + Pg[i] * dN[m, q, a, k]
+                            )
+
+
+@njit(cache=True)
+def deformed_gradients(elements, dN, u, out):
+    """Shape-function gradients with respect to the deformed shape, out (m, nq, nn, 3) = F^-T dN; returns min det F."""
+    H, C = np.zeros((3, 3)), np.zeros((3, 3))
+    smallest = np.inf
+    for m in range(elements.shape[0]):
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, _ = _invariants(H, C)
+            smallest = min(smallest, 1.0 + jm1)
+            for a in range(elements.shape[1]):
+                for i in range(3):
+                    out[m, q, a, i] = (
+                        dN[m, q, a, i] + C[i, 0] * dN[m, q, a, 0] + C[i, 1] * dN[m, q, a, 1] + C[i, 2] * dN[m, q, a, 2]
+                    ) / (1.0 + jm1)
+    return smallest
