@@ -1,40 +1,35 @@
 """The scene: what the user wants, checked and in mm, N and MPa."""
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
+from fab4d.errors import SceneError
+from fab4d.io.cards import PrinterCard, RigCard, load_material, load_printer, load_rig
+from fab4d.io.tables import (
+    Key,
+    fraction,
+    list_of,
+    non_negative,
+    number,
+    one_of,
+    positive,
+    read_keys,
+    read_toml,
+    text,
+    whole,
+)
 from fab4d.materials.cards import MaterialCard
+from fab4d.units import MM_PER_UNIT, mm_per
 
-
-@dataclass(frozen=True)
-class PrinterCard:
-    """A dual-extruder printer. Lengths in mm; `volume` is usable with both tools."""
-
-    name: str
-    volume: tuple[float, float, float]
-    line_width: float
-    layer_height: float
-    filament_diameter: float
-    source: str
-
-
-@dataclass(frozen=True)
-class RigCard:
-    """An actuator rig: how many points it pulls, how hard (N), through pads of what radius (mm)."""
-
-    name: str
-    max_points: int
-    max_force: float
-    patch_radius: float
-    pull_only: bool
-    source: str
+DEFAULT_CARDS = {"materials": "paper-corrected", "printer": "generic-dual-0.4", "rig": "bench"}
 
 
 @dataclass(frozen=True)
 class ClampRegion:
-    """A region held fixed: a box (2, 3) in mm, vertex numbers of the mesh file, or a named set of it."""
+    """A region held fixed: a box (2, 3) in mm, vertex numbers of the mesh file (from 0), or a named set of it."""
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     vertices: tuple[int, ...] | None = None
@@ -43,7 +38,8 @@ class ClampRegion:
 
 @dataclass(frozen=True)
 class Goal:
-    """tolerance: largest RMS distance to the temporary shape, mm (None: 5e-3 of the diagonal); max_forces: None: the rig's."""
+    """What the user wants. tolerance: largest RMS distance to the temporary shape, mm (None: 5e-3 of the diagonal);
+    max_forces: most points to pull (None: the rig's); max_smp_fraction: largest share of SMP in the volume."""
 
     tolerance: float | None = None
     max_forces: int | None = None
@@ -104,11 +100,111 @@ class Scene:
     gravity: Gravity | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RawMesh:
-    """A tet mesh as read: points (n, 3) in the file's unit, tets (m, 4) or (m, 10), named vertex sets, file name."""
+_TABLE = Key(lambda value: value)
+_CARD = {"card": Key(text)}
+_SECTIONS = {
+    "name": Key(text),
+    "units": Key(one_of(*MM_PER_UNIT), required=True),
+    "shape": Key(lambda value: value, required=True),
+} | dict.fromkeys(("materials", "printer", "rig", "goal", "weights", "acceptance", "solver", "gravity"), _TABLE)
+_SHAPE = {"permanent": Key(text, required=True), "temporary": Key(text, required=True)}
+_GOAL = {"tolerance": Key(positive), "max_forces": Key(whole(1)), "max_smp_fraction": Key(fraction)}
+_WEIGHTS = {weight.name: Key(non_negative) for weight in fields(Weights)}
+_ACCEPTANCE = {limit.name: Key(fraction) for limit in fields(Acceptance)}
+_SOLVER = {
+    "method": Key(one_of("reduced", "admm")),
+    "element": Key(one_of("linear", "quadratic")),
+    "seed": Key(whole(0)),
+}
+_GRAVITY = {"direction": Key(list_of(number, 3), required=True)}
+_CLAMP = {
+    "box": Key(list_of(list_of(number, 3), 2)),
+    "vertices": Key(list_of(whole(0))),
+    "set": Key(text),
+}
 
-    points: np.ndarray
-    tets: np.ndarray
-    sets: dict[str, np.ndarray]
-    file: str
+
+def load_scene(path: Path) -> Scene:
+    """The scene in the TOML file `path`, or in scene.toml of the folder `path`.
+
+    Mesh files and own cards are looked up relative to the scene; the mesh files are not opened.
+    Raises SceneError for an unknown key, a missing key or a wrong value, MaterialError for an unusable material card.
+    """
+    file = path / "scene.toml" if path.is_dir() else path
+    sections = read_keys(read_toml(file), _SECTIONS, str(file))
+    mm = mm_per(sections["units"])
+    shape = read_keys(sections["shape"], _SHAPE, f"{file} [shape]")
+    rig_section = read_keys(sections.get("rig", {}), {**_CARD, "clamp": _TABLE}, f"{file} [rig]")
+    scene = Scene(
+        name=sections.get("name", file.resolve().parent.name if file.name == "scene.toml" else file.stem),
+        units=sections["units"],
+        permanent=file.parent / shape["permanent"],
+        temporary=file.parent / shape["temporary"],
+        materials=load_material(_card_name("materials", sections, file), file.parent),
+        printer=load_printer(_card_name("printer", sections, file), file.parent),
+        rig=load_rig(rig_section.get("card", DEFAULT_CARDS["rig"]), file.parent),
+        clamp=_clamp(rig_section.get("clamp", []), mm, file),
+        goal=_goal(sections.get("goal", {}), mm, file),
+        weights=Weights(**read_keys(sections.get("weights", {}), _WEIGHTS, f"{file} [weights]")),
+        acceptance=Acceptance(**read_keys(sections.get("acceptance", {}), _ACCEPTANCE, f"{file} [acceptance]")),
+        solver=SolverSettings(**read_keys(sections.get("solver", {}), _SOLVER, f"{file} [solver]")),
+        gravity=_gravity(sections.get("gravity"), file),
+    )
+    _refuse_what_does_not_fit(scene, file)
+    return scene
+
+
+def _card_name(section: str, sections: Mapping[str, Any], file: Path) -> str:
+    keys = read_keys(sections.get(section, {}), _CARD, f"{file} [{section}]")
+    return str(keys.get("card", DEFAULT_CARDS[section]))
+
+
+def _goal(table: Any, mm: float, file: Path) -> Goal:
+    keys = read_keys(table, _GOAL, f"{file} [goal]")
+    if "tolerance" in keys:
+        keys["tolerance"] *= mm
+    return Goal(**keys)
+
+
+def _clamp(tables: Any, mm: float, file: Path) -> tuple[ClampRegion, ...]:
+    if not isinstance(tables, list):
+        msg = f"{file}: a clamp region is written [[rig.clamp]], with double brackets"
+        raise SceneError(msg)
+    return tuple(_clamp_region(table, mm, f"{file} [[rig.clamp]] {k + 1}") for k, table in enumerate(tables))
+
+
+def _clamp_region(table: Any, mm: float, where: str) -> ClampRegion:
+    keys = read_keys(table, _CLAMP, where)
+    if len(keys) != 1:
+        msg = f"{where} needs exactly one of box, vertices and set, and has {', '.join(keys) or 'none'}"
+        raise SceneError(msg)
+    if "box" not in keys:
+        return ClampRegion(vertices=keys.get("vertices"), set_name=keys.get("set"))
+    low, high = keys["box"]
+    if any(a > b for a, b in zip(low, high, strict=True)):
+        msg = f"{where} box must be [lowest corner, highest corner], not {list(low)} and {list(high)}"
+        raise SceneError(msg)
+    return ClampRegion(box=(tuple(mm * a for a in low), tuple(mm * b for b in high)))
+
+
+def _gravity(table: Any, file: Path) -> Gravity | None:
+    if table is None:
+        return None
+    direction = read_keys(table, _GRAVITY, f"{file} [gravity]")["direction"]
+    length = math.hypot(*direction)
+    if length == 0:
+        msg = f"{file} [gravity] direction must not be zero"
+        raise SceneError(msg)
+    # Without supports the free final shape cannot carry its weight, and supports are not part of a scene.
+    msg = f"{file}: gravity needs supports, which a scene cannot describe: remove the section [gravity]"
+    raise SceneError(msg)
+
+
+def _refuse_what_does_not_fit(scene: Scene, file: Path) -> None:
+    forces = scene.goal.max_forces
+    if forces is not None and forces > scene.rig.max_points:
+        msg = (
+            f'{file} [goal] max_forces is {forces}, but the rig "{scene.rig.name}" pulls at most '
+            f"{scene.rig.max_points} points: ask for fewer or choose another rig card"
+        )
+        raise SceneError(msg)
