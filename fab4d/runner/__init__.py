@@ -1,1 +1,1 @@
-"""Order, artifacts on disk, resuming, leaving out."""
+"""Executes the stage table on a run folder: order, files, what is current, resuming. Knows no physics."""
