@@ -1,0 +1,241 @@
+"""The two equilibria of model.md section 2: the held, hot median shape and the free, cold final shape."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fab4d.design.patches import Patches
+from fab4d.design.problem import Problem
+from fab4d.elasticity import _kernels as kernels
+from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern, build_pattern, dirichlet_mask
+from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.solvers.linear import Analysis, Factor, analyse
+from fab4d.solvers.newton import Solution, newton
+
+
+# Compliance of the rig, dimensionless: a patch is held at `held` up to this times its force, W x + RIG_COMPLIANCE f = held.
+# It is some 1e-5 of the compliance of a patch of the part, and keeps the KKT matrix quasi-definite, which a factorisation
+# without pivoting between supernodes needs. The equilibrium is exact whatever it is.
+RIG_COMPLIANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Median:
+    """The median shape x (N, 3) held at its patches, and the forces (K, 3) on the part there."""
+
+    x: FloatArray
+    forces: FloatArray
+    solution: Solution
+    gradients: FloatArray
+    """(m, nq, nn, 3) shape-function gradients with respect to x."""
+
+
+@dataclass(frozen=True, eq=False)
+class Final:
+    """The free final shape y (N, 3)."""
+
+    y: FloatArray
+    solution: Solution
+
+
+def mixed_moduli(problem: Problem, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """mu, kappa (m,) of the hot mixture: psi is linear in the moduli."""
+    hot, tpe = problem.rubbery, problem.tpe
+    return rho * hot.mu + (1 - rho) * tpe.mu, rho * hot.kappa + (1 - rho) * tpe.kappa
+
+
+def spread_vertices(X: FloatArray) -> IntArray:
+    """Three well-spread nodes: a far one, the one farthest from it, the one farthest from their line."""
+    a = int(np.argmax(np.linalg.norm(X - X.mean(axis=0), axis=1)))
+    b = int(np.argmax(np.linalg.norm(X - X[a], axis=1)))
+    axis = (X[b] - X[a]) / np.linalg.norm(X[b] - X[a])
+    rel = X - X[a]
+    c = int(np.argmax(np.linalg.norm(rel - np.outer(rel @ axis, axis), axis=1)))
+    return np.array([a, b, c])
+
+
+def three_two_one(x: FloatArray) -> IntArray:
+    """Six dofs that fix the rigid modes of the shape x (N, 3): three of one node, two of another, one of a third."""
+    a, b, c = spread_vertices(x)
+    along = np.argsort(-np.abs(x[b] - x[a]))
+    main, second, third = along
+    # With a fixed, b may move along the line a-b only; c stops the turn about that line.
+    normal_to_plane = np.abs(np.cross(x[b] - x[a], x[c] - x[a]))
+    last = int(np.argmax(np.where(np.arange(3) == main, -1.0, normal_to_plane)))
+    return np.array([3 * a, 3 * a + 1, 3 * a + 2, 3 * b + second, 3 * b + third, 3 * c + last])
+
+
+class Equilibria:
+    """Solves both equilibria of one problem with one set of patches; patterns and symbolic factors are built once."""
+
+    def __init__(self, problem: Problem, patches: Patches) -> None:
+        self.problem = problem
+        self.patches = patches
+        self.operator = patches.operator(problem.n_nodes)
+
+    @cached_property
+    def held_pattern(self) -> SymmetricPattern:
+        p = self.patches
+        return build_pattern(self.problem.body.elements, self.problem.n_nodes, p.rows, p.nodes, p.count)
+
+    @cached_property
+    def held_analysis(self) -> Analysis:
+        return analyse(self.held_pattern.indptr, self.held_pattern.indices)
+
+    @cached_property
+    def held_mask(self) -> DirichletMask:
+        nodes = np.flatnonzero(self.problem.clamp)
+        return dirichlet_mask(self.held_pattern, (3 * nodes[:, None] + np.arange(3)).ravel())
+
+    @cached_property
+    def free_pattern(self) -> SymmetricPattern:
+        return build_pattern(self.problem.body.elements, self.problem.n_nodes)
+
+    @cached_property
+    def free_analysis(self) -> Analysis:
+        return analyse(self.free_pattern.indptr, self.free_pattern.indices)
+
+    @cached_property
+    def free_mask(self) -> DirichletMask:
+        return dirichlet_mask(self.free_pattern, three_two_one(self.problem.X_temp))
+
+    def with_patches(self, patches: Patches) -> "Equilibria":
+        """The same problem with other patches; what does not depend on them is kept."""
+        other = Equilibria(self.problem, patches)
+        for name in ("free_pattern", "free_analysis", "free_mask", "block_structure"):
+            if name in self.__dict__:
+                other.__dict__[name] = self.__dict__[name]
+        return other
+
+    @cached_property
+    def block_structure(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Sorting of the element blocks (a, b) by row and column node: order, first of each sum, column nodes, row starts."""
+        elements, n_nodes = self.problem.body.elements, self.problem.n_nodes
+        keys = (elements[:, :, None] * n_nodes + elements[:, None, :]).ravel()
+        order = np.argsort(keys, kind="stable")
+        starts = np.flatnonzero(np.r_[True, np.diff(keys[order]) > 0])
+        unique = keys[order][starts]
+        return order, starts, unique % n_nodes, np.searchsorted(unique // n_nodes, np.arange(n_nodes + 1))
+
+    # -- median ------------------------------------------------------------------------------------------------------
+    def median_gradient(self, rho: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
+        """dW_med/dx (N, 3), W_med and min det F."""
+        body = self.problem.body
+        g = np.zeros_like(x)
+        energy, smallest = kernels.gradient(
+            body.elements, body.dN, body.weights, *mixed_moduli(self.problem, rho), x - body.X, g
+        )
+        return g, energy, smallest
+
+    def median_tangent(self, rho: FloatArray, x: FloatArray, spd: bool = False) -> FloatArray:
+        """Values of the KKT matrix [[K, -W^T], [-W, -RIG_COMPLIANCE I]] in the held pattern, clamp decoupled."""
+        body, pattern = self.problem.body, self.held_pattern
+        data = np.zeros(pattern.nnz)
+        assemble = kernels.tangent_spd if spd else kernels.tangent
+        assemble(
+            body.elements, body.dN, body.weights, *mixed_moduli(self.problem, rho), x - body.X,
+            pattern.rank, pattern.indptr, data,
+        )  # fmt: skip
+        data[pattern.coupling] = -self.patches.weights[:, None]
+        data[pattern.indptr[3 * pattern.n_nodes : -1]] = -RIG_COMPLIANCE
+        self.held_mask.apply(data, 1.0)
+        return data
+
+    def solve_median(
+        self,
+        rho: FloatArray,
+        held: FloatArray,
+        x: FloatArray,
+        forces: FloatArray,
+        tolerance: float = 1e-9,
+        max_iterations: int = 25,
+        extra: FloatArray | None = None,
+    ) -> Median:
+        """Median shape with the patch means at `held` (K, 3), from the guess x, forces.
+
+        extra : (N, 3) additional nodal forces on the part, for load paths. The tolerance is relative to the largest
+        nodal element force.
+        """
+        n, shape = 3 * self.problem.n_nodes, x.shape
+        fixed = self.held_mask.fixed
+        W = self.operator
+
+        def residual(z: FloatArray) -> tuple[FloatArray, float]:
+            x_z, f_z = z[:n].reshape(shape), z[n:].reshape(-1, 3)
+            g, energy, _ = self.median_gradient(rho, x_z)
+            if not np.isfinite(energy):
+                return np.full_like(z, np.inf), 1.0
+            applied = W.T @ f_z if extra is None else W.T @ f_z + extra
+            r = np.concatenate([(g - applied).ravel(), (held - W @ x_z - RIG_COMPLIANCE * f_z).ravel()])
+            scale = max(float(np.sqrt(g.ravel() @ g.ravel())), 1e-6)
+            r[fixed] = 0.0
+            return r, scale
+
+        def factor(z: FloatArray) -> Factor:
+            return self.held_analysis.factor(self.median_tangent(rho, z[:n].reshape(shape)))
+
+        def fallback(z: FloatArray) -> Factor:
+            return self.held_analysis.factor(self.median_tangent(rho, z[:n].reshape(shape), spd=True))
+
+        z = np.concatenate([x.ravel(), forces.ravel()])
+        solution = newton(residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count)
+        x = solution.z[:n].reshape(shape)
+        gradients = np.zeros_like(self.problem.body.dN)
+        kernels.deformed_gradients(self.problem.body.elements, self.problem.body.dN, x - self.problem.body.X, gradients)
+        return Median(x, solution.z[n:].reshape(-1, 3), solution, gradients)
+
+    # -- final -------------------------------------------------------------------------------------------------------
+    def _final_terms(self, rho: FloatArray, median: Median, y: FloatArray) -> list[tuple]:
+        """Kernel arguments of the glassy and the TPE term; zero moduli mark elements without that material."""
+        body, glassy, tpe = self.problem.body, self.problem.glassy, self.problem.tpe
+        return [
+            (body.elements, median.gradients, body.weights, rho * glassy.mu, rho * glassy.kappa, y - median.x),
+            (body.elements, body.dN, body.weights, (1 - rho) * tpe.mu, (1 - rho) * tpe.kappa, y - body.X),
+        ]
+
+    def final_gradient(self, rho: FloatArray, median: Median, y: FloatArray) -> tuple[FloatArray, float]:
+        """dW_fin/dy (N, 3) and W_fin (inf where an element is inverted)."""
+        g, total = np.zeros_like(y), 0.0
+        for term in self._final_terms(rho, median, y):
+            total += kernels.gradient(*term, g)[0]
+        return g, total
+
+    def final_tangent(self, rho: FloatArray, median: Median, y: FloatArray, spd: bool = False) -> FloatArray:
+        """Values of d2W_fin/dy2 in the free pattern, six dofs decoupled."""
+        pattern = self.free_pattern
+        data = np.zeros(pattern.nnz)
+        assemble = kernels.tangent_spd if spd else kernels.tangent
+        for term in self._final_terms(rho, median, y):
+            assemble(*term, pattern.rank, pattern.indptr, data)
+        self.free_mask.apply(data, 1.0)
+        return data
+
+    def solve_final(
+        self, rho: FloatArray, median: Median, y: FloatArray, tolerance: float = 1e-9, max_iterations: int = 25
+    ) -> Final:
+        """Final shape after unloading, from the guess y; the tolerance is relative to the largest nodal TPE force."""
+        shape, fixed = y.shape, self.free_mask.fixed
+        body, tpe = self.problem.body, self.problem.tpe
+        pull = np.zeros_like(y)
+        kernels.gradient(
+            body.elements, body.dN, body.weights, (1 - rho) * tpe.mu, (1 - rho) * tpe.kappa, median.x - body.X, pull
+        )
+        scale = max(float(np.sqrt(pull.ravel() @ pull.ravel())), 1e-6)
+
+        def residual(z: FloatArray) -> tuple[FloatArray, float]:
+            g, energy = self.final_gradient(rho, median, z.reshape(shape))
+            if not np.isfinite(energy):
+                return np.full_like(z, np.inf), scale
+            r = g.ravel()
+            r[fixed] = 0.0
+            return r, scale
+
+        def factor(z: FloatArray) -> Factor:
+            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape)))
+
+        def fallback(z: FloatArray) -> Factor:
+            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), spd=True))
+
+        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0)
+        return Final(solution.z.reshape(shape), solution)

@@ -1,0 +1,125 @@
+"""The objective of model.md section 4 and the limits of rig and material, with their Gauss-Newton pieces."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from fab4d.design.equilibria import Final, Median
+from fab4d.design.problem import Problem
+from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.mesh.tetmesh import FloatArray
+
+
+@dataclass(frozen=True)
+class ObjectiveWeights:
+    """Weights of the dimensionless terms; `error_scale` is the RMS error, in L0, at which E_p counts 1.
+
+    max_force : largest force of a patch, in mu_TPE L0^2          limit : weight of the penalty on larger ones
+    """
+
+    error_scale: float
+    lam_SMP: float = 0.0
+    lam_mat: float = 0.0
+    lam_smooth: float = 0.0
+    max_force: float = np.inf
+    limit: float = 100.0
+
+    def replace(self, **changes: float) -> "ObjectiveWeights":
+        return replace(self, **changes)
+
+
+def smoothness_matrix(problem: Problem) -> csr_array:
+    """L (m, m) with rho^T L rho = E_smooth = (1/A) sum_faces A_jk (rho_j - rho_k)^2, A the whole interior face area."""
+    j, k = problem.neighbours.T
+    w = problem.neighbour_areas / problem.neighbour_areas.sum()
+    m = problem.n_tets
+    off = csr_array((w, (j, k)), shape=(m, m))
+    off = off + off.T
+    return csr_array(diags_array(np.asarray(off.sum(axis=0)).ravel()) - off)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeError:
+    """Residual e (N, 3) = R y + t - X_temp of the aligned final shape, its rotation R and weighted RMS, in L0."""
+
+    e: FloatArray
+    R: FloatArray
+    rms: float
+
+
+def shape_error(problem: Problem, y: FloatArray) -> ShapeError:
+    """Distance of the final shape y (N, 3) to X_temp on the boundary, after the best rigid motion."""
+    a = problem.area_weights
+    R, t = best_rigid_motion(y, problem.X_temp, a)
+    e = y @ R.T + t - problem.X_temp
+    return ShapeError(e, R, float(np.sqrt(a @ (e**2).sum(axis=1))))
+
+
+def rigid_modes(y: FloatArray) -> FloatArray:
+    """(N, 3, 6) translations and infinitesimal rotations of the shape y."""
+    centred = y - y.mean(axis=0)
+    modes = np.zeros((len(y), 3, 6))
+    for i, axis in enumerate(np.eye(3)):
+        modes[:, i, i] = 1.0
+        modes[:, :, 3 + i] = np.cross(axis, centred)
+    return modes
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeMetric:
+    """The Gauss-Newton metric of E_p: dy -> W (dy without its rigid part); W = 2 diag(a) / error_scale^2."""
+
+    weights: FloatArray
+    modes: FloatArray
+    gram_inverse: FloatArray
+
+    def apply(self, dy: FloatArray) -> FloatArray:
+        """W P dy for dy (3N,) or (3N, k), P the projection along rigid modes; symmetric, positive semidefinite."""
+        w = self.weights if dy.ndim == 1 else self.weights[:, None]
+        weighted = w * dy
+        return weighted - w * (self.modes @ (self.gram_inverse @ (self.modes.T @ weighted)))
+
+
+def shape_metric(problem: Problem, y: FloatArray, error_scale: float) -> ShapeMetric:
+    """Metric of E_p / error_scale^2 at the final shape y."""
+    w = np.repeat(2.0 * problem.area_weights / error_scale**2, 3)
+    modes = rigid_modes(y).reshape(-1, 6)
+    return ShapeMetric(w, modes, np.linalg.inv(modes.T @ (w[:, None] * modes)))
+
+
+def force_excess(forces: FloatArray, max_force: float) -> FloatArray:
+    """(K,) how far the size of each force is beyond the largest one, relative to it."""
+    return np.maximum(np.linalg.norm(forces, axis=1) / max_force - 1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DensityTerms:
+    """Value, gradient (m,) and diagonal of a positive semidefinite Hessian model of the terms in rho alone."""
+
+    value: float
+    gradient: FloatArray
+    curvature: FloatArray
+
+
+def density_terms(weights: ObjectiveWeights, v: FloatArray, L: csr_array, rho: FloatArray) -> DensityTerms:
+    """E_SMP, E_mat and E_smooth at rho (m,); v (m,) volume fractions. E_smooth's Hessian 2 lam_smooth L is apart."""
+    g = rho * (1 - rho)
+    slope = 1 - 2 * rho
+    smooth = L @ rho
+    value = (
+        weights.lam_SMP * float(v @ rho**2)
+        + 16 * weights.lam_mat * float(v @ g**2)
+        + weights.lam_smooth * float(rho @ smooth)
+    )
+    gradient = v * (2 * weights.lam_SMP * rho + 32 * weights.lam_mat * g * slope) + 2 * weights.lam_smooth * smooth
+    bend = 32 * weights.lam_mat * (slope**2 - 2 * g)
+    return DensityTerms(value, gradient, v * (2 * weights.lam_SMP + np.maximum(bend, 0.0)))
+
+
+def objective_value(
+    problem: Problem, weights: ObjectiveWeights, terms: DensityTerms, median: Median, final: Final
+) -> float:
+    """The whole objective, each term dimensionless."""
+    error = shape_error(problem, final.y).rms / weights.error_scale
+    return error**2 + terms.value + weights.limit * float((force_excess(median.forces, weights.max_force) ** 2).sum())

@@ -1,0 +1,122 @@
+"""Derivatives of both equilibria with respect to the density and the held positions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import bsr_array, csc_array
+
+from fab4d.design.equilibria import Equilibria, Final, Median
+from fab4d.elasticity import _kernels as kernels
+from fab4d.materials.cards import Moduli
+from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.solvers.linear import Factor
+
+
+def _element_forces(
+    equilibria: Equilibria, gradients: FloatArray, moduli: Moduli, u: FloatArray
+) -> FloatArray:
+    body = equilibria.problem.body
+    out = np.zeros((*body.elements.shape, 3))
+    ones = np.ones(len(body.elements))
+    kernels.element_forces(body.elements, gradients, body.weights, moduli.mu * ones, moduli.kappa * ones, u, out)
+    return out
+
+
+def _density_columns(equilibria: Equilibria, forces: FloatArray) -> csc_array:
+    """(3N, m) matrix whose column j holds the nodal forces (nn, 3) of element j."""
+    elements = equilibria.problem.body.elements
+    m, nn = elements.shape
+    rows = (3 * elements[:, :, None] + np.arange(3)).reshape(m, 3 * nn)
+    indptr = np.arange(0, m * 3 * nn + 1, 3 * nn)
+    return csc_array((forces.ravel(), rows.ravel(), indptr), shape=(3 * equilibria.problem.n_nodes, m))
+
+
+def _mixed_matrix(equilibria: Equilibria, rho: FloatArray, median: Median, y: FloatArray) -> bsr_array:
+    """M = d(dW_fin/dy)/dx as a (3N, 3N) matrix of 3 x 3 blocks; an element's blocks are summed on multiplication."""
+    body, glassy = equilibria.problem.body, equilibria.problem.glassy
+    m, nn = body.elements.shape
+    blocks = np.zeros((m, nn, nn, 3, 3))
+    kernels.mixed(
+        body.elements, median.gradients, body.weights, rho * glassy.mu, rho * glassy.kappa, y - median.x, blocks
+    )
+    order, starts, indices, indptr = equilibria.block_structure
+    summed = np.add.reduceat(blocks.reshape(-1, 3, 3)[order], starts, axis=0)
+    n = 3 * equilibria.problem.n_nodes
+    return bsr_array((summed, indices, indptr), shape=(n, n))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The linear maps of solver.md section 1 about one pair of equilibria.
+
+    With R = d residual / d rho and M = d(dW_fin/dy)/dx:
+        [K_x, -W^T; -W, -d] [dx; df] = [-R_x drho; -dc],        dy = -K_y^-1 (R_y drho + M dx)
+    """
+
+    held: Factor
+    free: Factor
+    held_fixed: IntArray
+    free_fixed: IntArray
+    M: bsr_array
+    MT: bsr_array
+    R_x: csc_array
+    R_y: csc_array
+    n_patches: int
+
+    def forward(self, drho: FloatArray, dc: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """dx (N, 3), df (K, 3), dy (N, 3) of changes drho (m,) and dc (K, 3) of the held positions."""
+        n = self.M.shape[0]
+        rhs = np.concatenate([-(self.R_x @ drho), -dc.ravel()])
+        rhs[self.held_fixed] = 0.0
+        z = self.held.solve(rhs)
+        r = -(self.R_y @ drho + self.M @ z[:n])
+        r[self.free_fixed] = 0.0
+        return z[:n].reshape(-1, 3), z[n:].reshape(-1, 3), self.free.solve(r).reshape(-1, 3)
+
+    def adjoint(self, gx: FloatArray, gf: FloatArray, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients with respect to rho (m,) and held positions (K, 3) of a function with gradients gx, gf, gy.
+
+        gy must be free of rigid modes, for y is fixed up to them only.
+        """
+        n = self.M.shape[0]
+        b = gy.ravel().copy()
+        b[self.free_fixed] = 0.0
+        ly = self.free.solve(b)
+        rhs = np.concatenate([gx.ravel() - self.MT @ ly, gf.ravel()])
+        rhs[self.held_fixed] = 0.0
+        lz = self.held.solve(rhs)
+        return -(lz[:n] @ self.R_x) - ly @ self.R_y, -lz[n:].reshape(-1, 3)
+
+    def held_columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """dx/dc, df/dc, dy/dc as (3N, 3K), (3K, 3K), (3N, 3K)."""
+        n, k = self.M.shape[0], 3 * self.n_patches
+        if k == 0:
+            return np.zeros((n, 0)), np.zeros((0, 0)), np.zeros((n, 0))
+        rhs = np.zeros((n + k, k))
+        rhs[n + np.arange(k), np.arange(k)] = -1.0
+        z = self.held.solve_many(rhs)
+        r = -(self.M @ z[:n])
+        r[self.free_fixed] = 0.0
+        return z[:n], z[n:], self.free.solve_many(r)
+
+
+def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Final) -> Linearisation:
+    """Factor both tangents at the equilibria and form their derivatives with respect to rho and x."""
+    problem = equilibria.problem
+    held = equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x))
+    free = equilibria.free_analysis.factor(equilibria.final_tangent(rho, median, final.y))
+    body = problem.body
+    hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
+    M = _mixed_matrix(equilibria, rho, median, final.y)
+    cold = _element_forces(equilibria, median.gradients, problem.glassy, final.y - median.x)
+    return Linearisation(
+        held=held,
+        free=free,
+        held_fixed=equilibria.held_mask.fixed,
+        free_fixed=equilibria.free_mask.fixed,
+        M=M,
+        MT=M.T.tobsr(blocksize=(3, 3)),
+        R_x=_density_columns(equilibria, _element_forces(equilibria, body.dN, hot, median.x - body.X)),
+        R_y=_density_columns(equilibria, cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X)),
+        n_patches=equilibria.patches.count,
+    )
