@@ -1,0 +1,1 @@
+"""The shapes of the sample scenes: meshes, warps, and the catalogue that puts them together."""

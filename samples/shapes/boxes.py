@@ -1,0 +1,77 @@
+"""Tet meshes from hexahedral cells.
+
+A hexahedron is eight vertices in bit order: corner k lies at (k & 1, k >> 1 & 1, k >> 2) of the cell's own axes.
+"""
+
+from itertools import permutations
+
+import numpy as np
+
+from fab4d.mesh.measures import tet_volumes
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
+# One tet for each order in which the three axes can be walked from corner 0 to corner 7 (Kuhn's division).
+SIX_TETS = np.array([[0, 1 << a, (1 << a) + (1 << b), 7] for a, b, _ in permutations(range(3))])
+# A tet on every second corner and one cut off at each of the others; neighbours must alternate between the two.
+FIVE_TETS = np.array(
+    [
+        [[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]],
+        [[1, 2, 4, 7], [0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7]],
+    ]
+)
+
+
+def grid_vertices(xs: FloatArray, ys: FloatArray, zs: FloatArray) -> FloatArray:
+    """Vertices (n, 3) of the grid with lines at xs, ys, zs; x runs fastest."""
+    z, y, x = np.meshgrid(zs, ys, xs, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+
+
+def grid_cells(shape: tuple[int, int, int]) -> IntArray:
+    """Cell numbers (c, 3) along x, y, z of a grid of `shape` cells; x runs fastest."""
+    k, j, i = np.indices(shape[::-1]).reshape(3, -1)
+    return np.column_stack([i, j, k])
+
+
+def grid_hexes(shape: tuple[int, int, int]) -> IntArray:
+    """Hexahedra (c, 8) of a grid of `shape` cells, in the vertex order of `grid_vertices`."""
+    strides = np.array([1, shape[0] + 1, (shape[0] + 1) * (shape[1] + 1)])
+    return (grid_cells(shape) @ strides)[:, None] + CORNERS @ strides
+
+
+def positively_oriented(X: FloatArray, tets: IntArray) -> IntArray:
+    """`tets` with the last two vertices swapped where the volume is negative."""
+    flipped = tets.copy()
+    negative = tet_volumes(X, tets) < 0
+    flipped[negative, 2], flipped[negative, 3] = tets[negative, 3], tets[negative, 2]
+    return flipped
+
+
+def six_tets(X: FloatArray, hexes: IntArray) -> IntArray:
+    """Six tets for each hexahedron. Faces match when neighbours run their axes the same way along the shared face."""
+    return positively_oriented(X, hexes[:, SIX_TETS].reshape(-1, 4))
+
+
+def five_tets(X: FloatArray, hexes: IntArray, cells: IntArray) -> IntArray:
+    """Five tets for each hexahedron; `cells` (c, 3) are the cell numbers, whose parity chooses the division."""
+    parity = cells.sum(axis=1) % 2
+    return positively_oriented(X, hexes[np.arange(len(hexes))[:, None, None], FIVE_TETS[parity]].reshape(-1, 4))
+
+
+def compacted(X: FloatArray, cells: IntArray) -> tuple[FloatArray, IntArray]:
+    """Without the vertices that no cell uses."""
+    used, inverse = np.unique(cells, return_inverse=True)
+    return X[used], inverse.reshape(cells.shape)
+
+
+def box(size: tuple[float, float, float], shape: tuple[int, int, int], division: str) -> tuple[FloatArray, IntArray]:
+    """A box from the origin to `size` in `shape` cells, each divided into `five` or `six` tets."""
+    X = grid_vertices(*(np.linspace(0.0, length, n + 1) for length, n in zip(size, shape, strict=True)))
+    hexes = grid_hexes(shape)
+    return X, six_tets(X, hexes) if division == "six" else five_tets(X, hexes, grid_cells(shape))
+
+
+def kept_cells(X: FloatArray, hexes: IntArray, inside: BoolArray) -> tuple[FloatArray, IntArray]:
+    """The hexahedra marked in `inside` (c,) and their vertices alone."""
+    return compacted(X, hexes[inside])
