@@ -1,9 +1,11 @@
-"""Compiled element loops of the neo-Hookean solid (model.md section 2).
+"""Compiled element loops of the neo-Hookean solid; the formulas in plain NumPy are in neo_hooke.py.
 
-All of them take elements (m, nn), shape-function gradients dN (m, nq, nn, 3), weights (m, nq), moduli mu, kappa (m,) and
-nodal displacements u (N, 3) from the shape that dN belongs to. An element of zero modulus mu is skipped. Everything is
-evaluated with H = F - I, because the glassy phase works at strains where det F - 1 would lose its digits.
+All of them take elements (m, nn), shape-function gradients dN (m, nq, nn, 3) in 1/mm, weights (m, nq) in mm^3, moduli
+mu, kappa (m,) in MPa and nodal displacements u (N, 3) in mm from the shape that dN belongs to. An element of zero mu is
+skipped. Everything is evaluated with H = F - I, because the glassy phase works at strains where det F - 1 would lose
+its digits.
 """
+# mypy: disable-error-code="no-untyped-def"
 
 import math
 
@@ -11,6 +13,7 @@ import numpy as np
 from numba import njit
 
 _INVERTED = -1.0
+_JACOBI_SWEEPS = 30
 
 
 @njit(cache=True, inline="always")
@@ -137,7 +140,7 @@ def _tangent_vectors(H, C, jm1, dN, f, g):
 
 @njit(cache=True, inline="always")
 def _tangent_scalars(jm1, e, mu, kappa, w):
-    """Factors of: delta_ik dN_a.dN_b, f_a g_b + g_a f_b, g_a,i g_b,k, g_b,i g_a,k (from dP[H] with H = e_k (x) dN_b)."""
+    """Factors of delta_ik dN_a.dN_b, f_a g_b + g_a f_b, g_a,i g_b,k and g_b,i g_a,k: dP[H] with H = e_k (x) dN_b."""
     J = 1.0 + jm1
     m = w * mu * math.exp(-2.0 / 3.0 * math.log1p(jm1))
     return (
@@ -187,6 +190,129 @@ def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
                             if i == k:
                                 value += dot
                             data[base + i] += value
+                    pair += 1
+
+
+@njit(cache=True)
+def _eigen_symmetric(A, V):
+    """Cyclic Jacobi: eigenvectors of A (3, 3) as columns of V; A is overwritten, eigenvalues on its diagonal."""
+    for i in range(3):
+        for j in range(3):
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_JACOBI_SWEEPS):
+        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
+        if off <= 1e-17 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
+                t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(1.0 + theta * theta))
+                c = 1.0 / math.sqrt(1.0 + t * t)
+                s = t * c
+                for k in range(3):
+                    A[k, p], A[k, q] = c * A[k, p] - s * A[k, q], s * A[k, p] + c * A[k, q]
+                    V[k, p], V[k, q] = c * V[k, p] - s * V[k, q], s * V[k, p] + c * V[k, q]
+                for k in range(3):
+                    A[p, k], A[q, k] = c * A[p, k] - s * A[q, k], s * A[p, k] + c * A[q, k]
+
+
+@njit(cache=True)
+def _singular_frame(H, A, U, V, sigma):
+    """F = I + H = U diag(sigma) V^T; A (3, 3) is scratch."""
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = H[i, j] + H[j, i] + H[0, i] * H[0, j] + H[1, i] * H[1, j] + H[2, i] * H[2, j]
+    _eigen_symmetric(A, V)
+    for k in range(3):
+        square = 0.0
+        for i in range(3):
+            U[i, k] = V[i, k] + H[i, 0] * V[0, k] + H[i, 1] * V[1, k] + H[i, 2] * V[2, k]
+            square += U[i, k] * U[i, k]
+        sigma[k] = math.sqrt(square)
+        for i in range(3):
+            U[i, k] /= sigma[k]
+
+
+@njit(cache=True)
+def _positive_part(sigma, s0, s1, s2, s3, A, V, scaling, same, swapped):
+    """Eigenvalues of dP/dF below zero set to zero, in the singular frame of F.
+
+    There dP_ii = sum_k scaling_ik H_kk and dP_ij = same_ij H_ij + swapped_ij H_ji; the second has the eigenvalues
+    same +- swapped for symmetric and skew H, whatever the singular values are. A, V (3, 3) are scratch.
+    """
+    for i in range(3):
+        for k in range(3):
+            A[i, k] = s1 * (sigma[i] / sigma[k] + sigma[k] / sigma[i]) + s2 / (sigma[i] * sigma[k])
+            plus = max(s0 + s3 / (sigma[i] * sigma[k]), 0.0)
+            minus = max(s0 - s3 / (sigma[i] * sigma[k]), 0.0)
+            same[i, k], swapped[i, k] = 0.5 * (plus + minus), 0.5 * (plus - minus)
+        A[i, i] += s0 + s3 / (sigma[i] * sigma[i])
+    _eigen_symmetric(A, V)
+    for i in range(3):
+        for k in range(3):
+            scaling[i, k] = 0.0
+            for j in range(3):
+                scaling[i, k] += V[i, j] * max(A[j, j], 0.0) * V[k, j]
+
+
+@njit(cache=True)
+def _frame_block(na, nb, scaling, same, swapped, block):
+    """block_ik = sum_jl T_ijkl na_j nb_l for the projected tangent T of `_positive_part`."""
+    for i in range(3):
+        for k in range(3):
+            if i != k:
+                block[i, k] = scaling[i, k] * na[i] * nb[k] + swapped[i, k] * na[k] * nb[i]
+        j, l = (i + 1) % 3, (i + 2) % 3
+        block[i, i] = scaling[i, i] * na[i] * nb[i] + same[i, j] * na[j] * nb[j] + same[i, l] * na[l] * nb[l]
+
+
+@njit(cache=True)
+def _scatter_rotated(U, block, column, r, indptr, data):
+    """Adds U block U^T as the r-th block below the diagonal of three columns, or on the diagonal (r < 0)."""
+    for k in range(3):
+        if r < 0:
+            base, start = indptr[column + k] - k, k
+        else:
+            base, start = indptr[column + k] + 3 - k + 3 * r, 0
+        for i in range(start, 3):
+            for p in range(3):
+                for q in range(3):
+                    data[base + i] += U[i, p] * block[p, q] * U[k, q]
+
+
+@njit(cache=True)
+def tangent_spd(elements, dN, weights, mu, kappa, u, rank, indptr, data):
+    """As `tangent`, with dP/dF of each quadrature point replaced by its positive semidefinite part.
+
+    Source: Smith, de Goes, Kim, "Analytic Eigensystems for Isotropic Distortion Energies", ACM TOG 38 (2019) 3.
+    """
+    nn = elements.shape[1]
+    H, C, A = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    U, V, W, sigma = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
+    scaling, same, swapped, block = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    n = np.zeros((nn, 3))
+    for m in range(elements.shape[0]):
+        if mu[m] == 0.0:
+            continue
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], weights[m, q])
+            _singular_frame(H, A, U, V, sigma)
+            for a in range(nn):
+                for i in range(3):
+                    n[a, i] = V[0, i] * dN[m, q, a, 0] + V[1, i] * dN[m, q, a, 1] + V[2, i] * dN[m, q, a, 2]
+            _positive_part(sigma, s0, s1, s2, s3, A, W, scaling, same, swapped)
+            pair = 0
+            for a0 in range(nn):
+                for b0 in range(a0 + 1):
+                    a, b = a0, b0
+                    if elements[m, a] < elements[m, b]:
+                        a, b = b0, a0
+                    _frame_block(n[a], n[b], scaling, same, swapped, block)
+                    _scatter_rotated(U, block, 3 * elements[m, b], rank[m, pair], indptr, data)
                     pair += 1
 
 
