@@ -1,9 +1,9 @@
 """The compressible neo-Hookean solid at a point: energy density, stress and its derivative, in the form one reads.
 
-The source paper (Sun et al., "Computational Design of Self-actuated Deformable Solids via Shape Memory Material") prints
-this energy in its equations (1), (18) and (19) and its stresses in (2) and (3). Read them with two corrections: the
-bracket of (1), (18), (19) is J^(-2/3) I1 - 3 (as printed, the rest state is under stress), and the factor of tr(C) C^-1
-in (2) is mu/3, not mu/2. Then (2) and (3) are the derivatives of (1).
+The source paper (Sun et al., "Computational Design of Self-actuated Deformable Solids via Shape Memory Material")
+prints this energy in its equations (1), (18) and (19) and its stresses in (2) and (3). Read them with two corrections:
+the bracket of (1), (18), (19) is J^(-2/3) I1 - 3 (as printed, the rest state is under stress), and the factor of
+tr(C) C^-1 in (2) is mu/3, not mu/2. Then (2) and (3) are the derivatives of (1).
 
 Moduli mu, kappa are in MPa, scalars or (m,); deformation gradients F (m, 3, 3) must have J = det F > 0.
 """
