@@ -35,6 +35,10 @@ class Table:
     def names(self) -> tuple[str, ...]:
         return tuple(stage.name for stage in self.stages)
 
+    def stage(self, name: str) -> Stage:
+        """The stage called `name`."""
+        return next(stage for stage in self.stages if stage.name == name)
+
     def writer(self, artifact: str) -> Stage:
         """The stage that writes `artifact`."""
         return next(stage for stage in self.stages if artifact in stage.writes)

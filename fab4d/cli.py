@@ -1,0 +1,223 @@
+"""The commands. They import what they use when they run, so that `fab4d --help` is quick."""
+
+import re
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fab4d import __version__
+from fab4d.errors import ArtifactError, DesignRejectedError, Fab4dError, InterruptedRunError
+from fab4d.runner.table import stage_table
+
+if TYPE_CHECKING:
+    from fab4d.io.meshes import RawMesh
+    from fab4d.runner.display import Display
+    from fab4d.runner.job import Job
+    from fab4d.runner.runner import Selection
+    from fab4d.runner.workspace import Workspace
+
+# EX_USAGE of sysexits.h, for click's own 2 would look like a rejected design.
+USAGE_EXIT_CODE = 64
+
+STAGE_HELP = {
+    "check": "Check the two shapes and the scene: the mesh doctor.",
+    "solve": "Find where SMP goes and where to pull, still grey.",
+    "threshold": "Round the material to SMP and TPE and clean it up.",
+    "refit": "Fit the held positions to the rounded material.",
+    "verify": "Simulate the rounded design anew, from the permanent shape.",
+    "bodies": "Write the watertight bodies to print.",
+    "rig": "Write the sheet to stand at the rig with.",
+    "report": "Write the report, the curve of error and the verified state.",
+}
+
+
+class Commands(click.Group):
+    """A group in the order of its definition, whose usage errors have an exit code of their own."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        return list(self.commands)
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with _usage_errors_end_the_command():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with _usage_errors_end_the_command():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _usage_errors_end_the_command() -> Iterator[None]:
+    try:
+        yield
+    except click.UsageError as error:
+        error.show()
+        raise click.exceptions.Exit(USAGE_EXIT_CODE) from error
+
+
+class Command(click.Command):
+    """A command that ends with a message and the exit code of its error; --debug shows the trace."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.params.append(click.Option(["--debug"], is_flag=True, help="Show the trace of an error."))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        debug = ctx.params.pop("debug")
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            raise
+        except (Fab4dError, OSError, KeyboardInterrupt) as error:
+            if debug:
+                traceback.print_exception(error)
+            known = _known(error)
+            click.echo(f"fab4d: {known}", err=True)
+            return ctx.exit(known.exit_code)
+
+
+def _known(error: BaseException) -> Fab4dError:
+    if isinstance(error, Fab4dError):
+        return error
+    return ArtifactError(str(error)) if isinstance(error, OSError) else InterruptedRunError("stopped")
+
+
+def _scene_command(function: Callable[..., None]) -> Callable[..., None]:
+    """What every command on a scene takes."""
+    out = click.option(
+        "--out", type=click.Path(path_type=Path), help="Run folder; runs/<name of the scene> if not given."
+    )
+    return click.argument("scene", type=click.Path(path_type=Path))(out(function))
+
+
+@click.group(cls=Commands)
+@click.version_option(__version__, prog_name="fab4d")
+def main() -> None:
+    """From two shapes of one part to print files and a rig sheet for 4D printing.
+
+    SCENE is a TOML file, or a folder with a scene.toml.
+    """
+
+
+@main.command(cls=Command)
+@_scene_command
+@click.option("--from", "first", type=click.Choice(stage_table().names), help="Take what earlier stages left as it is.")
+@click.option("--until", "last", type=click.Choice(stage_table().names), help="Stop after this stage.")
+@click.option("--force", is_flag=True, help="Run the stages even where they are current.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def run(scene: Path, out: Path | None, first: str | None, last: str | None, force: bool, quiet: bool) -> None:
+    """Make the whole design. Finished stages are skipped, a stopped run goes on."""
+    from fab4d.runner.runner import Selection
+
+    stages = [stage.name for stage in stage_table().between(first, last)]
+    if not stages:
+        msg = f"--from {first} comes after --until {last}: the order is {', '.join(stage_table().names)}"
+        raise click.UsageError(msg)
+    _run(_open_job(scene, out), Selection(first, last, frozenset(stages if force else ())), quiet)
+
+
+def _run(job: "Job", selection: "Selection", quiet: bool) -> None:
+    """Run, tell the verdict or how far it went, and raise DesignRejectedError for a rejected design."""
+    from fab4d.runner.runner import execute
+    from fab4d.runner.summary import REJECTED, file_lines, report_lines, unfinished_lines
+
+    execute(job, selection, _display(quiet))
+    finished = selection.last in (None, job.table.names[-1])
+    report = job.workspace.load("report_json") if finished else None
+    lines = report_lines(report) if report else unfinished_lines(job, selection.last)
+    click.echo("\n".join([*lines, *file_lines(job.workspace)]))
+    if report and report["verdict"] == REJECTED:
+        msg = f"design rejected: {'; '.join(report['reasons'])}"
+        raise DesignRejectedError(msg)
+
+
+def _open_job(scene_path: Path, out: Path | None) -> "Job":
+    from fab4d.io.scene import load_scene
+    from fab4d.runner.job import Job
+    from fab4d.runner.workspace import Workspace
+
+    scene = load_scene(scene_path)
+    folder = out or Path("runs") / _file_name(scene.name)
+    file = scene_path / "scene.toml" if scene_path.is_dir() else scene_path
+    sources = {"scene": file, "permanent": scene.permanent, "temporary": scene.temporary}
+    return Job(stage_table(), Workspace(folder, stage_table().artifacts), scene, sources, _read_mesh)
+
+
+def _file_name(name: str) -> str:
+    """`name` as a folder name on every system."""
+    return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "scene"
+
+
+def _read_mesh(path: Path) -> "RawMesh":
+    from fab4d.io.meshes import read_mesh
+
+    return read_mesh(path)
+
+
+def _display(quiet: bool) -> "Display":
+    from fab4d.runner.display import SilentDisplay, TerminalDisplay
+
+    return SilentDisplay() if quiet else TerminalDisplay(sys.stderr)
+
+
+def _stage_command(name: str) -> click.Command:
+    """The command that runs up to stage `name`."""
+
+    @main.command(name, cls=Command, help=f"{STAGE_HELP[name]} Runs the stages that it needs.")
+    @_scene_command
+    @click.option("--force", is_flag=True, help=f"Run {name} even where it is current.")
+    @click.option("--quiet", is_flag=True, help="Show no progress.")
+    def stage(scene: Path, out: Path | None, force: bool, quiet: bool) -> None:
+        from fab4d.runner.runner import Selection
+
+        _run(_open_job(scene, out), Selection(None, name, frozenset({name} if force else ())), quiet)
+
+    return stage
+
+
+@main.command(cls=Command)
+@_scene_command
+def plan(scene: Path, out: Path | None) -> None:
+    """Tell what would run and roughly how long, and what is left out and why."""
+    from fab4d.runner.outlook import plan_lines
+
+    with tempfile.TemporaryDirectory() as folder:
+        doctor = _checked(_open_job(scene, Path(folder)))
+        lines = plan_lines(_open_job(scene, out), doctor.load("mesh"), doctor.load("check_report"))
+    click.echo("\n".join(lines))
+
+
+@main.command(cls=Command, help=STAGE_HELP["check"])
+@_scene_command
+def check(scene: Path, out: Path | None) -> None:
+    from fab4d.runner.summary import finding_lines
+
+    with tempfile.TemporaryDirectory() as folder:
+        report = _checked(_open_job(scene, out or Path(folder))).load("check_report")
+    click.echo("\n".join(finding_lines(report)))
+
+
+def _checked(job: "Job") -> "Workspace":
+    """The run folder of `job` with stage check done."""
+    from fab4d.runner.runner import Selection, execute
+
+    execute(job, Selection(last="check"), _display(quiet=True))
+    return job.workspace
+
+
+for _name in stage_table().names[1:]:
+    _stage_command(_name)
+
+
+@main.command(cls=Command)
+def cards() -> None:
+    """List the cards that come with fab4d: materials, printers, rigs."""
+    from fab4d.runner.summary import card_lines
+
+    click.echo("\n".join(card_lines()))
