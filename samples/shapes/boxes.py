@@ -75,3 +75,16 @@ def box(size: tuple[float, float, float], shape: tuple[int, int, int], division:
 def kept_cells(X: FloatArray, hexes: IntArray, inside: BoolArray) -> tuple[FloatArray, IntArray]:
     """The hexahedra marked in `inside` (c,) and their vertices alone."""
     return compacted(X, hexes[inside])
+
+
+def merged(corners: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Vertices and hexahedra (c, 8) of cells given by `corners` (c, 8, 3); corners equal to 1e-6 become one vertex."""
+    places, inverse = np.unique(np.round(corners.reshape(-1, 3), 6), axis=0, return_inverse=True)
+    first = np.zeros(len(places), np.int64)
+    first[inverse.ravel()[::-1]] = np.arange(len(inverse.ravel()))[::-1]
+    return corners.reshape(-1, 3)[first], inverse.reshape(-1, 8)
+
+
+def cell_corners(cells: IntArray) -> FloatArray:
+    """Corners (c, 8, 3) of unit cells at the cell numbers `cells` (c, 3)."""
+    return (cells[:, None, :] + CORNERS).astype(np.float64)

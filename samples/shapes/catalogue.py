@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
+from shapes import gripper as grip
+from shapes import tower as lattice
 from shapes.boxes import box
 from shapes.scene import Sample
-from shapes.warps import Turn, bump, ramp, rod, twisted_plate, warped
+from shapes.warps import Turn, bump, moved_together, ramp, rod, twisted_plate, warped
 
 
 def strip() -> Sample:
@@ -24,6 +28,45 @@ def twist_bar() -> Sample:
     return Sample(title, X, X_temp, tets, ((-1, -1, -1), (width + 1, 6, 6)), 8, 4e-3)
 
 
-COMMITTED: dict[str, Callable[[], Sample]] = {"strip": strip, "twist-bar": twist_bar}
+def tower() -> Sample:
+    """A lattice tower bent by 80 degrees, more where it is slender."""
+    X, tets = lattice.lattice_tower()
+    start = lattice.layer_heights()[lattice.FOOT]
+    profile = lambda s: ramp(s, 0, 25) / lattice.width(s + start)  # noqa: E731
+    X_temp = warped(X, rod((0, 0, start), (0, 0, lattice.HEIGHT), (1, 0, 0)), (Turn((0, 0, 1), 80, profile),))
+    half = 0.5 * float(lattice.width(np.zeros(1))[0]) + 1.0
+    clamp = ((-half, -half, -1.0), (half, half, round(start + 0.5, 2)))
+    return Sample("A lattice tower bent by 80 degrees.", X, X_temp, tets, clamp, 8, 5e-3)
+
+
+def gripper() -> Sample:
+    """Three legs that close over the hub by 100 degrees."""
+    X, tets = grip.three_legs()
+    root = grip.APOTHEM + 8.0
+    legs = []
+    for angle in grip.DIRECTIONS:
+        x, y = np.cos(angle), np.sin(angle)
+        tip, mid = grip.APOTHEM + grip.REACH, grip.THICKNESS / 2
+        line = rod((root * x, root * y, mid), (tip * x, tip * y, mid), (0, 0, 1))
+        legs.append(warped(X, line, (Turn((0, 0, 1), 100, bump(0, line.length)),)))
+    clamp = ((-15.5, -15.5, -1.0), (15.5, 15.5, grip.THICKNESS + 1.0))
+    return Sample("Three legs closing by 100 degrees.", X, moved_together(X, *legs), tets, clamp, 9, 4e-3, 0.20)
+
+
+def snake() -> Sample:
+    """A long box curled to half a circle; 24 x 10 x 10 cells of six tets."""
+    X, tets = box((192.0, 24.0, 24.0), (24, 10, 10), "six")
+    line = rod((8, 12, 12), (192, 12, 12), (0, 1, 0))
+    X_temp = warped(X, line, (Turn((0, 0, 1), 180, bump(0, line.length, 0.2)),))
+    return Sample("A long box curled by 180 degrees.", X, X_temp, tets, ((-1, -1, -1), (9, 25, 25)), 8, 1e-2)
+
+
+COMMITTED: dict[str, Callable[[], Sample]] = {
+    "strip": strip,
+    "twist-bar": twist_bar,
+    "tower": tower,
+    "gripper": gripper,
+    "snake": snake,
+}
 ON_DEMAND: dict[str, Callable[[], Sample]] = {}
 SAMPLES = COMMITTED | ON_DEMAND

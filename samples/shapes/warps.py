@@ -89,6 +89,11 @@ def warped(X: FloatArray, line: Rod, turns: tuple[Turn, ...], stretch: float = 1
     return line.origin + (centre + frame.apply(off_line)) @ line.frame
 
 
+def moved_together(X: FloatArray, *positions: FloatArray) -> FloatArray:
+    """X plus the displacements of several warps, each of which leaves the others' region where it is."""
+    return X + sum(x - X for x in positions)
+
+
 def _march(kappa: FloatArray, step: float, stretch: float) -> tuple[Rotation, FloatArray]:
     """Frames and centre-line points at the beginning of each step."""
     whole, half = Rotation.from_rotvec(kappa * step), Rotation.from_rotvec(0.5 * kappa * step)
