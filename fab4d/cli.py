@@ -196,11 +196,11 @@ def plan(scene: Path, out: Path | None) -> None:
 @main.command(cls=Command, help=STAGE_HELP["check"])
 @_scene_command
 def check(scene: Path, out: Path | None) -> None:
-    from fab4d.runner.summary import finding_lines
+    from fab4d.runner.summary import doctor_lines
 
     with tempfile.TemporaryDirectory() as folder:
         report = _checked(_open_job(scene, out or Path(folder))).load("check_report")
-    click.echo("\n".join(finding_lines(report)))
+    click.echo("\n".join(doctor_lines(report)))
 
 
 def _checked(job: "Job") -> "Workspace":

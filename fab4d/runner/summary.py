@@ -66,11 +66,14 @@ def file_lines(workspace: Workspace) -> list[str]:
     return [f"files in {workspace.root}:", *(f"  {path:<20} {note}" for path, note in paths)]
 
 
-def finding_lines(check_report: Mapping[str, Any]) -> list[str]:
-    """The findings of the mesh doctor, one a line, or that there are none."""
-    findings = check_report["findings"]
-    lines = [f"{finding['severity']:<8} {finding['code']}: {finding['message']}" for finding in findings]
-    return lines or ["no findings: the two shapes are fit to be programmed"]
+def doctor_lines(check_report: Mapping[str, Any]) -> list[str]:
+    """The findings of the mesh doctor, then the figures of the two shapes."""
+    findings = [f"{found['severity']:<8} {found['code']}: {found['message']}" for found in check_report["findings"]]
+    verdict = (
+        "nothing to program: the shapes are equal up to a rigid motion" if check_report["nothing_to_program"] else ""
+    )
+    statistics = [f"  {name:<22} {value:.6g}" for name, value in check_report["statistics"].items()]
+    return [*(findings or ["no findings"]), *filter(None, [verdict]), *statistics]
 
 
 def card_lines() -> list[str]:

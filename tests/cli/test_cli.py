@@ -70,7 +70,12 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         monkeypatch.setitem(sys.modules, f"fab4d.stages.{name}", module)
     written["mesh"] = {"X": np.eye(4, 3) * 50, "tets": np.array([[0, 1, 2, 3]])}
     finding = {"severity": "warning", "code": "thin", "file": "a.vtk", "message": "one tet thick", "count": 1}
-    written["check_report"] = {"findings": [finding], "left_out": [{"what": "gravity", "why": "the scene has none"}]}
+    written["check_report"] = {
+        "findings": [finding],
+        "nothing_to_program": False,
+        "statistics": {"min_det_F": 0.5},
+        "left_out": [{"what": "gravity", "why": "the scene has none"}],
+    }
     return written
 
 
@@ -214,10 +219,18 @@ def test_a_stage_command_runs_up_to_its_stage_and_tells_what_is_out_of_date(scen
 @pytest.mark.usefixtures("stages")
 def test_check_tells_the_findings_and_leaves_nothing_behind(scene: Path, tmp_path: Path) -> None:
     result = fab4d("check", scene)
-    assert result.stdout == "warning  thin: one tet thick\n"
+    assert result.stdout == "warning  thin: one tet thick\n  min_det_F              0.5\n"
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
     fab4d("check", scene, "--out", "kept")
     assert Path("kept/work/mesh.npz").is_file()
+
+
+def test_check_says_when_there_is_nothing_to_program(scene: Path, stages: dict[str, Any]) -> None:
+    stages["check_report"] |= {"findings": [], "nothing_to_program": True}
+    assert fab4d("check", scene).stdout.splitlines()[:2] == [
+        "no findings",
+        "nothing to program: the shapes are equal up to a rigid motion",
+    ]
 
 
 @pytest.mark.usefixtures("stages")
