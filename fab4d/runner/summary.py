@@ -69,11 +69,10 @@ def file_lines(workspace: Workspace) -> list[str]:
 def doctor_lines(check_report: Mapping[str, Any]) -> list[str]:
     """The findings of the mesh doctor, then the figures of the two shapes."""
     findings = [f"{found['severity']:<8} {found['code']}: {found['message']}" for found in check_report["findings"]]
-    verdict = (
-        "nothing to program: the shapes are equal up to a rigid motion" if check_report["nothing_to_program"] else ""
-    )
+    if check_report["nothing_to_program"]:
+        findings.append("nothing to program: the shapes are equal up to a rigid motion")
     statistics = [f"  {name:<22} {value:.6g}" for name, value in check_report["statistics"].items()]
-    return [*(findings or ["no findings"]), *filter(None, [verdict]), *statistics]
+    return [*(findings or ["no findings"]), *statistics]
 
 
 def card_lines() -> list[str]:

@@ -227,10 +227,8 @@ def test_check_tells_the_findings_and_leaves_nothing_behind(scene: Path, tmp_pat
 
 def test_check_says_when_there_is_nothing_to_program(scene: Path, stages: dict[str, Any]) -> None:
     stages["check_report"] |= {"findings": [], "nothing_to_program": True}
-    assert fab4d("check", scene).stdout.splitlines()[:2] == [
-        "no findings",
-        "nothing to program: the shapes are equal up to a rigid motion",
-    ]
+    first = fab4d("check", scene).stdout.splitlines()[0]
+    assert first == "nothing to program: the shapes are equal up to a rigid motion"
 
 
 @pytest.mark.usefixtures("stages")
