@@ -29,8 +29,8 @@ REFINE_ABOVE = 1e-14
 MAX_REFINEMENTS = 5
 # Relative to its own compliance, how far rslab's factor lets a constraint give before refinement.
 CONSTRAINT_SOFTNESS = 1e-6
-# A factor whose refined solutions stay above this has lost its digits to vanishing pivots.
-UNUSABLE_ABOVE = 1e-8
+# A factor whose refined solutions stay above both, relative to |A| |x| + |b| and to |b|, hides vanishing pivots.
+UNUSABLE_ABOVE, UNSOLVED_ABOVE = 1e-12, 1e-6
 
 
 Solve = Callable[[FloatArray], FloatArray]
@@ -140,12 +140,12 @@ class _Scaling:
 
 
 def _check_regular(factor: Factor, scale: FloatArray) -> None:
-    """Raise SingularMatrixError when a load of the size of the matrix rows, of random signs, moves its nodes too far.
+    """Raise SingularMatrixError when a random load of the size of the matrix rows moves an unknown too far.
 
     Rounding turns vanishing pivots into tiny ones, so that a factorisation does not notice a missing support.
     """
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scale))
-    response = np.abs(factor.solve(scale * signs) * scale)
+    load = np.random.default_rng(0).standard_normal(len(scale))
+    response = np.abs(factor.solve(scale * load) * scale)
     row = int(np.argmax(response))
     if not response[row] < SINGULAR_RESPONSE:
         msg = f"the matrix is singular: unknown {row} moves by {response[row]:.1e} under a load of the size of its row"
@@ -161,12 +161,13 @@ def _refined(solve: Solve, product: Solve, size: float, b: FloatArray) -> FloatA
     for step in range(MAX_REFINEMENTS + 1):
         residual = b - product(x)
         error = np.max(np.abs(residual), initial=0.0)
-        reference = size * np.max(np.abs(x), initial=0.0) + np.max(np.abs(b), initial=0.0)
+        load = np.max(np.abs(b), initial=0.0)
+        reference = size * np.max(np.abs(x), initial=0.0) + load
         if error <= REFINE_ABOVE * reference or step == MAX_REFINEMENTS:
             break
         x = x + solve(residual)
-    if not error <= UNUSABLE_ABOVE * reference:
-        msg = f"vanishing pivots: a solution misses its right-hand side by {error / reference:.1e}"
+    if not error <= max(UNUSABLE_ABOVE * reference, UNSOLVED_ABOVE * load):
+        msg = f"vanishing pivots: a solution misses its right-hand side {load:.1e} by {error:.1e}"
         raise SingularMatrixError(msg)
     return x
 
