@@ -43,8 +43,20 @@ class Declared(Mapping[str, Any]):
 
 
 def stage_function(name: str) -> StageFunction:
-    """`run` of the module fab4d.stages.<name>, imported only now."""
-    function: StageFunction = importlib.import_module(f"fab4d.stages.{name}").run
+    """`run` of the module fab4d.stages.<name>, imported only now.
+
+    Raises ArtifactError when numba finds no folder to keep the compiled kernels in.
+    """
+    try:
+        function: StageFunction = importlib.import_module(f"fab4d.stages.{name}").run
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        msg = (
+            "neither the folder of fab4d nor the user's cache folder is writable, so compiled code cannot be kept: "
+            "set the environment variable NUMBA_CACHE_DIR to a folder that is"
+        )
+        raise ArtifactError(msg) from error
     return function
 
 
