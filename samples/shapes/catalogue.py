@@ -4,10 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from shapes import face, fish
 from shapes import gripper as grip
 from shapes import tower as lattice
 from shapes.boxes import box
+from shapes.plates import outline_triangles, thickened
 from shapes.scene import Sample
+from shapes.stuffing import stuffed
 from shapes.warps import Turn, bump, moved_together, ramp, rod, twisted_plate, warped
 
 
@@ -53,6 +56,24 @@ def gripper() -> Sample:
     return Sample("Three legs closing by 100 degrees.", X, moved_together(X, *legs), tets, clamp, 9, 4e-3, 0.20)
 
 
+def fin() -> Sample:
+    """A fish-like body in an S-bend, held at the head."""
+    X, tets = stuffed(fish.fish, fish.LOW, fish.HIGH, 5.4)
+    line = rod((50, 0, 0), (fish.LENGTH, 0, 0), (0, 1, 0))
+    turns = (Turn((0, 0, 1), 50, bump(0, 75, 0.4)), Turn((0, 0, 1), -75, bump(55, 130, 0.4)))
+    clamp = ((-1, -15, -25), (49, 15, 25))
+    return Sample("A fish-like body in an S-bend.", X, warped(X, line, turns), tets, clamp, 8, 2e-3)
+
+
+def smiley() -> Sample:
+    """A thin face that opens its mouth and bows."""
+    X, tets = thickened(*outline_triangles(face.face, (-55, -55), (55, 55), 3.4), face.THICKNESS, 2)
+    mid = face.THICKNESS / 2
+    line = rod((0, 34, mid), (0, -face.RADIUS, mid), (0, 0, 1))
+    X_temp = warped(face.mouth_opened(X), line, (Turn((0, 0, 1), 60, bump(0, line.length)),))
+    return Sample("A thin face that opens its mouth and bows.", X, X_temp, tets, ((-56, 34, -1), (56, 56, 6)), 10, 4e-3)
+
+
 def snake() -> Sample:
     """A long box curled to half a circle; 24 x 10 x 10 cells of six tets."""
     X, tets = box((192.0, 24.0, 24.0), (24, 10, 10), "six")
@@ -66,6 +87,8 @@ COMMITTED: dict[str, Callable[[], Sample]] = {
     "twist-bar": twist_bar,
     "tower": tower,
     "gripper": gripper,
+    "fin": fin,
+    "smiley": smiley,
     "snake": snake,
 }
 ON_DEMAND: dict[str, Callable[[], Sample]] = {}
