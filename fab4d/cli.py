@@ -124,8 +124,9 @@ def run(scene: Path, out: Path | None, first: str | None, last: str | None, forc
 
 def _run(job: "Job", selection: "Selection", quiet: bool) -> None:
     """Run, tell the verdict or how far it went, and raise DesignRejectedError for a rejected design."""
+    from fab4d.report.verdict import REJECTED
     from fab4d.runner.runner import execute
-    from fab4d.runner.summary import REJECTED, file_lines, report_lines, unfinished_lines
+    from fab4d.runner.summary import file_lines, report_lines, unfinished_lines
 
     execute(job, selection, _display(quiet))
     finished = selection.last in (None, job.table.names[-1])

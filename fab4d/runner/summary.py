@@ -10,8 +10,6 @@ from fab4d.runner.job import Job
 from fab4d.runner.runner import Selection, plan
 from fab4d.runner.workspace import Workspace
 
-REJECTED = "REJECTED"
-
 
 def _error_text(error: Mapping[str, float]) -> str:
     kinds = {"rms": "RMS", "max": "max", "hausdorff": "Hausdorff"}
