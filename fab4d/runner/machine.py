@@ -4,7 +4,7 @@ import importlib.metadata
 import platform
 import sys
 
-PACKAGES = ("fab4d", "numpy", "scipy", "numba", "rslab", "meshio", "manifold3d", "trimesh", "reportlab")
+PACKAGES = ("fab4d", "numpy", "scipy", "numba", "rslab", "meshio", "manifold3d", "trimesh", "reportlab", "matplotlib")
 
 
 def versions() -> dict[str, str | None]:
