@@ -11,7 +11,7 @@ from fab4d.elasticity import _kernels as kernels
 from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern, build_pattern, dirichlet_mask
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.solvers.linear import Analysis, Factor, analyse
-from fab4d.solvers.newton import Solution, newton
+from fab4d.solvers.newton import Residual, Solution, newton
 
 
 # Compliance of the rig, dimensionless: a patch is held at `held` up to this times its force, W x + RIG_COMPLIANCE f = held.
@@ -161,16 +161,16 @@ class Equilibria:
         fixed = self.held_mask.fixed
         W = self.operator
 
-        def residual(z: FloatArray) -> tuple[FloatArray, float]:
+        def residual(z: FloatArray) -> Residual:
             x_z, f_z = z[:n].reshape(shape), z[n:].reshape(-1, 3)
             g, energy, _ = self.median_gradient(rho, x_z)
-            if not np.isfinite(energy):
-                return np.full_like(z, np.inf), 1.0
             applied = W.T @ f_z if extra is None else W.T @ f_z + extra
-            r = np.concatenate([(g - applied).ravel(), (held - W @ x_z - RIG_COMPLIANCE * f_z).ravel()])
+            gap = held - W @ x_z
+            r = np.concatenate([(g - applied).ravel(), (gap - RIG_COMPLIANCE * f_z).ravel()])
             scale = max(float(np.sqrt(g.ravel() @ g.ravel())), 1e-6)
             r[fixed] = 0.0
-            return r, scale
+            work = 0.0 if extra is None else float((extra * x_z).sum())
+            return Residual(r, scale, energy + float((gap**2).sum()) / (2 * RIG_COMPLIANCE) - work)
 
         def factor(z: FloatArray) -> Factor:
             return self.held_analysis.factor(self.median_tangent(rho, z[:n].reshape(shape)))
@@ -223,13 +223,11 @@ class Equilibria:
         )
         scale = max(float(np.sqrt(pull.ravel() @ pull.ravel())), 1e-6)
 
-        def residual(z: FloatArray) -> tuple[FloatArray, float]:
+        def residual(z: FloatArray) -> Residual:
             g, energy = self.final_gradient(rho, median, z.reshape(shape))
-            if not np.isfinite(energy):
-                return np.full_like(z, np.inf), scale
             r = g.ravel()
             r[fixed] = 0.0
-            return r, scale
+            return Residual(r, scale, energy)
 
         def factor(z: FloatArray) -> Factor:
             return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape)))

@@ -1,14 +1,17 @@
 """Gauss-Newton steps on density and held positions; every accepted iterate is in equilibrium."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median
 from fab4d.design.objective import (
+    DensityTerms,
     ObjectiveWeights,
+    ShapeMetric,
     density_terms,
     force_excess,
     objective_value,
@@ -17,7 +20,6 @@ from fab4d.design.objective import (
 )
 from fab4d.design.sensitivity import Linearisation, linearise
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
-from fab4d.solvers.linear import SingularMatrixError
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,72 +50,123 @@ def equilibrate(
     return Design(rho, held, median, final) if final.solution.converged else None
 
 
+# A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
+HELD_STEP = 0.05
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The quadratic model of the objective at a design, held positions eliminated exactly."""
+    """The quadratic model of the objective at a design, in drho (m,) with the held positions eliminated exactly.
+
+    gradient_rho (m,), gradient_c (3K,) : gradient of the objective
+    dy_dc (3N, 3K), df_dc (3K, 3K) : derivatives of final shape and forces with respect to the held positions
+    force_rows (k, 3K) : d(excess)/df of the forces beyond the limit, times sqrt(2 limit)
+    H_cc (3K, 3K) : Gauss-Newton Hessian of the held positions
+    """
 
     lin: Linearisation
+    metric: ShapeMetric
     gradient_rho: FloatArray
     gradient_c: FloatArray
     dy_dc: FloatArray
     df_dc: FloatArray
     force_rows: FloatArray
-    """(k, 3K) rows of the active force limits: d(excess)/df, scaled by sqrt(2 limit)."""
-    metric: Callable[[FloatArray], FloatArray]
     H_cc: FloatArray
-    curvature: FloatArray
+    terms: DensityTerms
     L: csr_array
     lam_smooth: float
 
-    def hessian_rho(self, v: FloatArray, damping: FloatArray) -> FloatArray:
-        """Schur complement of the held positions in the damped Gauss-Newton Hessian, times v (m,)."""
-        zero = np.zeros((self.lin.n_patches, 3))
-        dx, df, dy = self.lin.forward(v, zero)
-        gy, gf = self.metric(dy.ravel()), self.force_rows.T @ (self.force_rows @ df.ravel())
-        dc = -np.linalg.solve(self.H_cc, self.dy_dc.T @ gy + self.df_dc.T @ gf) if len(self.H_cc) else zero.ravel()
-        dy2, df2 = dy.ravel() + self.dy_dc @ dc, df.ravel() + self.df_dc @ dc
-        gy, gf = self.metric(dy2), self.force_rows.T @ (self.force_rows @ df2)
-        g_rho, _ = self.lin.adjoint(np.zeros_like(dx), gf.reshape(-1, 3), gy.reshape(-1, 3))
-        return g_rho + (self.curvature + damping) * v + 2 * self.lam_smooth * (self.L @ v)
+    def damped(self, damping: float, volume_fractions: FloatArray) -> "DampedModel":
+        """The model with Levenberg-Marquardt terms that hold back density and held positions alike."""
+        k = len(self.H_cc)
+        held = self.H_cc + 2 * (damping + 1e-9) / (max(k, 1) * HELD_STEP**2) * np.eye(k)
+        return DampedModel(self, damping * volume_fractions, cho_factor(held) if k else None)
+
+
+@dataclass(frozen=True, eq=False)
+class DampedModel:
+    """A model, its damping of the density (m,), and the factored, damped H_cc."""
+
+    model: Model
+    damping: FloatArray
+    held_factor: tuple | None
+
+    def _held(self, rhs: FloatArray) -> FloatArray:
+        return cho_solve(self.held_factor, rhs) if self.held_factor is not None else np.zeros(0)
+
+    def _pull_back(self, dy: FloatArray, df: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients with respect to y (3N,) and f (3K,) of the quadratic terms at dy, df."""
+        rows = self.model.force_rows
+        return self.model.metric.apply(dy), rows.T @ (rows @ df)
+
+    def _onto_held(self, gy: FloatArray, gf: FloatArray) -> FloatArray:
+        return self.model.dy_dc.T @ gy + self.model.df_dc.T @ gf
+
+    def reduced_gradient(self) -> FloatArray:
+        """(m,) gradient with respect to rho once the held positions have made their best step."""
+        m = self.model
+        dc = -self._held(m.gradient_c)
+        gy, gf = self._pull_back(m.dy_dc @ dc, m.df_dc @ dc)
+        return m.gradient_rho + m.lin.adjoint_rho(gf, gy)
+
+    def hessian(self, v: FloatArray) -> FloatArray:
+        """Damped Gauss-Newton Hessian of rho, held positions eliminated, times v (m,)."""
+        m = self.model
+        dy, df = m.lin.forward_rho(v)
+        dc = -self._held(self._onto_held(*self._pull_back(dy, df)))
+        gy, gf = self._pull_back(dy + m.dy_dc @ dc, df + m.df_dc @ dc)
+        return (
+            m.lin.adjoint_rho(gf, gy) + (m.terms.curvature + self.damping) * v + 2 * m.lam_smooth * (m.L @ v)
+        )
+
+    def diagonal(self) -> FloatArray:
+        """(m,) the part of the Hessian's diagonal that costs nothing: the Jacobi preconditioner."""
+        m = self.model
+        return m.terms.curvature + self.damping + 2 * m.lam_smooth * m.L.diagonal()
 
     def held_step(self, drho: FloatArray) -> FloatArray:
-        """The held-position change (K, 3) that minimises the model for a given drho (m,)."""
-        if not len(self.H_cc):
-            return np.zeros((0, 3))
-        _, df, dy = self.lin.forward(drho, np.zeros((self.lin.n_patches, 3)))
-        coupling = self.dy_dc.T @ self.metric(dy.ravel()) + self.df_dc.T @ (
-            self.force_rows.T @ (self.force_rows @ df.ravel())
-        )
-        return -np.linalg.solve(self.H_cc, self.gradient_c.ravel() + coupling).reshape(-1, 3)
+        """(K, 3) the held-position change that minimises the model for a given drho (m,)."""
+        m = self.model
+        dy, df = m.lin.forward_rho(drho)
+        return -self._held(m.gradient_c + self._onto_held(*self._pull_back(dy, df))).reshape(-1, 3)
 
 
-def build_model(
-    equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design, damping_c: float
-) -> Model:
+def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design) -> Model:
     """Linearise both equilibria at the design and form the quadratic model."""
-    problem = equilibria.problem
+    problem, f = equilibria.problem, design.median.forces
     lin = linearise(equilibria, design.rho, design.median, design.final)
     error = shape_error(problem, design.final.y)
-    gy = (2 * problem.area_weights[:, None] * (error.e @ error.R)) / weights.error_scale**2
-    f = design.median.forces
-    size = np.linalg.norm(f, axis=1)
-    excess = force_excess(f, weights.max_force)
-    active = np.flatnonzero(excess > 0)
-    rows = np.zeros((len(active), f.size))
-    for row, p in enumerate(active):
-        rows[row, 3 * p : 3 * p + 3] = np.sqrt(2 * weights.limit) * f[p] / (size[p] * weights.max_force)
-    gf = (rows.T @ (np.sqrt(2 * weights.limit) * excess[active])).reshape(-1, 3)
-    g_rho, g_c = lin.adjoint(np.zeros_like(gy), gf, gy)
+    gy = 2 * problem.area_weights[:, None] * (error.e @ error.R) / weights.error_scale**2
+    rows, excess = _force_rows(weights, f)
+    g_rho, g_c = lin.adjoint(np.zeros_like(gy), (rows.T @ excess).reshape(-1, 3), gy)
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
-    metric = shape_metric(problem, design.final.y, weights.error_scale).apply
+    metric = shape_metric(problem, design.final.y, weights.error_scale)
     _, df_dc, dy_dc = lin.held_columns()
-    force_part = rows @ df_dc
-    H = dy_dc.T @ metric(dy_dc) + force_part.T @ force_part
-    H = 0.5 * (H + H.T)
-    H += damping_c * np.diag(np.diag(H).mean() * np.ones(len(H))) if len(H) else 0.0
+    H = dy_dc.T @ metric.apply(dy_dc) + (rows @ df_dc).T @ (rows @ df_dc)
     return Model(
-        lin, g_rho + terms.gradient, g_c, dy_dc, df_dc, rows, metric, H, terms.curvature, L, weights.lam_smooth
+        lin=lin,
+        metric=metric,
+        gradient_rho=g_rho + terms.gradient,
+        gradient_c=g_c.ravel(),
+        dy_dc=dy_dc,
+        df_dc=df_dc,
+        force_rows=rows,
+        H_cc=0.5 * (H + H.T),
+        terms=terms,
+        L=L,
+        lam_smooth=weights.lam_smooth,
     )
+
+
+def _force_rows(weights: ObjectiveWeights, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rows (k, 3K) and values (k,) whose squares, halved, sum to the penalty on forces beyond the limit."""
+    excess = force_excess(forces, weights.max_force)
+    active = np.flatnonzero(excess > 0)
+    rows = np.zeros((len(active), forces.size))
+    scale = np.sqrt(2 * weights.limit)
+    for row, p in enumerate(active):
+        rows[row, 3 * p : 3 * p + 3] = scale * forces[p] / (np.linalg.norm(forces[p]) * weights.max_force)
+    return rows, scale * excess[active]
 
 
 def _conjugate_gradients(
@@ -141,7 +194,7 @@ def _conjugate_gradients(
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one Gauss-Newton step ended in."""
+    """The design after one Gauss-Newton step, its objective, the next damping, and whether the step was taken."""
 
     design: Design
     value: float
@@ -154,76 +207,69 @@ def gauss_newton_step(
     weights: ObjectiveWeights,
     L: csr_array,
     design: Design,
-    value: float,
     damping: float,
     movable: BoolArray | None = None,
-    cg_iterations: int = 30,
     tries: int = 6,
 ) -> Step:
-    """One damped step; the damping falls after a good prediction and rises until the objective falls.
+    """One Levenberg-Marquardt step on density and held positions; the damping rises until the objective falls.
 
     movable : (m,) tets whose density may change; None for all
     """
-    problem = equilibria.problem
-    v = problem.volume_fractions
-    model = build_model(equilibria, weights, L, design, damping_c=1e-6)
-    smooth_diagonal = 2 * weights.lam_smooth * L.diagonal()
-    for _ in range(tries):
-        damp = damping * v
-        # gradient with the held positions eliminated
-        g = model.gradient_rho.copy()
-        if len(model.H_cc):
-            dc0 = -np.linalg.solve(model.H_cc, model.gradient_c.ravel())
-            gy, gf = model.metric(model.dy_dc @ dc0), model.force_rows.T @ (model.force_rows @ (model.df_dc @ dc0))
-            g += model.lin.adjoint(np.zeros((problem.n_nodes, 3)), gf.reshape(-1, 3), gy.reshape(-1, 3))[0]
-        free = ~((design.rho <= 0) & (g > 0)) & ~((design.rho >= 1) & (g < 0))
-        if movable is not None:
-            free &= movable
-        drho = np.zeros_like(design.rho)
-        for _ in range(2):
-            diagonal = model.curvature + damp + smooth_diagonal
-            rhs = -g - (model.hessian_rho(drho, damp) if drho.any() else 0.0)
-            drho = drho + _conjugate_gradients(
-                lambda p, damp=damp: model.hessian_rho(p, damp), rhs, diagonal, free, cg_iterations, 0.05
-            )
-            clipped = np.clip(design.rho + drho, 0, 1) - design.rho
-            hit = free & (clipped != drho)
-            drho = clipped
-            if not hit.any():
-                break
-            free &= ~hit
-        dc = model.held_step(drho)
-        trial = _trial(equilibria, model, design, drho, dc)
+    value = evaluate(equilibria, weights, L, design)
+    model = build_model(equilibria, weights, L, design)
+    for attempt in range(tries):
+        damped = model.damped(damping, equilibria.problem.volume_fractions)
+        drho = _density_step(damped, design.rho, movable)
+        trial = _trial(equilibria, model, design, drho, damped.held_step(drho))
         if trial is not None:
-            terms = density_terms(weights, v, L, trial.rho)
-            new = objective_value(problem, weights, terms, trial.median, trial.final)
+            new = evaluate(equilibria, weights, L, trial)
             if new < value:
-                return Step(trial, new, damping / 3, True)
-        damping *= 4
+                return Step(trial, new, damping / 3 if attempt == 0 else damping, True)
+        damping *= 5
     return Step(design, value, damping, False)
 
 
+def evaluate(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design) -> float:
+    """The objective at a design."""
+    problem = equilibria.problem
+    terms = density_terms(weights, problem.volume_fractions, L, design.rho)
+    return objective_value(problem, weights, terms, design.median, design.final)
+
+
+def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | None, n_cg: int = 30) -> FloatArray:
+    """Change of rho (m,) that lowers the model within 0 <= rho <= 1: CG on the free tets, then again without those hit."""
+    drho = np.zeros_like(rho)
+    if movable is not None and not movable.any():
+        return drho
+    g = damped.reduced_gradient()
+    free = ~((rho <= 0) & (g > 0)) & ~((rho >= 1) & (g < 0))
+    if movable is not None:
+        free &= movable
+    diagonal = damped.diagonal()
+    for _ in range(2):
+        rhs = -g - damped.hessian(drho) if drho.any() else -g
+        wanted = drho + _conjugate_gradients(damped.hessian, rhs, diagonal, free, n_cg, 0.05)
+        drho = np.clip(rho + wanted, 0, 1) - rho
+        hit = free & (drho != wanted)
+        if not hit.any():
+            break
+        free &= ~hit
+    return drho
+
+
 def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArray, dc: FloatArray) -> Design | None:
+    """The equilibria after a step: from the linear prediction, or else from where the design is."""
     dx, df, dy = model.lin.forward(drho, dc)
-    held = design.median.x
-    c = equilibria.patches.mean(held) + RIG_COMPLIANCE * design.median.forces + dc
-    body = equilibria.problem.body
-    x, f, y = design.median.x + dx, design.median.forces + df, design.final.y + dy
-    del body
-    try:
-        trial = equilibrate(equilibria, design.rho + drho, c, x, f, y)
-        if trial is None:
-            trial = equilibrate(equilibria, design.rho + drho, c, design.median.x, design.median.forces, design.final.y)
-    except SingularMatrixError:
-        return None
-    return trial
+    median, y = design.median, design.final.y
+    rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
+    guesses = ((median.x + dx, median.forces + df, y + dy), (median.x, median.forces, y))
+    for x0, f0, y0 in guesses:
+        trial = equilibrate(equilibria, rho, held, x0, f0, y0)
+        if trial is not None:
+            return trial
+    return None
 
 
-def held_of(equilibria: Equilibria, median: Median) -> FloatArray:
-    """Held positions (K, 3) at which the median's forces act."""
+def held_positions(equilibria: Equilibria, median: Median) -> FloatArray:
+    """(K, 3) the held positions at which the median's forces act."""
     return equilibria.patches.mean(median.x) + RIG_COMPLIANCE * median.forces
-
-
-def snapped(design: Design, rho: FloatArray) -> Design:
-    """The design with another density, equilibria not yet solved."""
-    return replace(design, rho=rho)

@@ -15,12 +15,15 @@ from fab4d.mesh.tetmesh import FloatArray
 class ObjectiveWeights:
     """Weights of the dimensionless terms; `error_scale` is the RMS error, in L0, at which E_p counts 1.
 
+    lam_round weighs (4/V) sum_j V_j rho_j (1 - rho_j): unlike E_mat it has a slope at 0 and 1, so densities reach them.
+
     max_force : largest force of a patch, in mu_TPE L0^2          limit : weight of the penalty on larger ones
     """
 
     error_scale: float
     lam_SMP: float = 0.0
     lam_mat: float = 0.0
+    lam_round: float = 0.0
     lam_smooth: float = 0.0
     max_force: float = np.inf
     limit: float = 100.0
@@ -110,9 +113,11 @@ def density_terms(weights: ObjectiveWeights, v: FloatArray, L: csr_array, rho: F
     value = (
         weights.lam_SMP * float(v @ rho**2)
         + 16 * weights.lam_mat * float(v @ g**2)
+        + 4 * weights.lam_round * float(v @ g)
         + weights.lam_smooth * float(rho @ smooth)
     )
-    gradient = v * (2 * weights.lam_SMP * rho + 32 * weights.lam_mat * g * slope) + 2 * weights.lam_smooth * smooth
+    push = 2 * weights.lam_SMP * rho + 32 * weights.lam_mat * g * slope + 4 * weights.lam_round * slope
+    gradient = v * push + 2 * weights.lam_smooth * smooth
     bend = 32 * weights.lam_mat * (slope**2 - 2 * g)
     return DensityTerms(value, gradient, v * (2 * weights.lam_SMP + np.maximum(bend, 0.0)))
 

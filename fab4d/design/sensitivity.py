@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
+from scipy.sparse import bsr_array, csc_array, csr_array
 
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.elasticity import _kernels as kernels
@@ -61,6 +61,8 @@ class Linearisation:
     MT: bsr_array
     R_x: csc_array
     R_y: csc_array
+    R_xT: csr_array
+    R_yT: csr_array
     n_patches: int
 
     def forward(self, drho: FloatArray, dc: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -72,6 +74,21 @@ class Linearisation:
         r = -(self.R_y @ drho + self.M @ z[:n])
         r[self.free_fixed] = 0.0
         return z[:n].reshape(-1, 3), z[n:].reshape(-1, 3), self.free.solve(r).reshape(-1, 3)
+
+    def forward_rho(self, drho: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """dy (3N,) and df (3K,) of a change drho (m,) at fixed held positions."""
+        n = self.M.shape[0]
+        rhs = np.zeros(n + 3 * self.n_patches)
+        rhs[:n] = -(self.R_x @ drho)
+        rhs[self.held_fixed] = 0.0
+        z = self.held.solve(rhs)
+        r = -(self.R_y @ drho + self.M @ z[:n])
+        r[self.free_fixed] = 0.0
+        return self.free.solve(r), z[n:]
+
+    def adjoint_rho(self, gf: FloatArray, gy: FloatArray) -> FloatArray:
+        """Gradient (m,) with respect to rho of a function with gradients gf (3K,), gy (3N,) at fixed held positions."""
+        return self.adjoint(np.zeros_like(gy), gf, gy)[0]
 
     def adjoint(self, gx: FloatArray, gf: FloatArray, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradients with respect to rho (m,) and held positions (K, 3) of a function with gradients gx, gf, gy.
@@ -85,7 +102,7 @@ class Linearisation:
         rhs = np.concatenate([gx.ravel() - self.MT @ ly, gf.ravel()])
         rhs[self.held_fixed] = 0.0
         lz = self.held.solve(rhs)
-        return -(lz[:n] @ self.R_x) - ly @ self.R_y, -lz[n:].reshape(-1, 3)
+        return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:].reshape(-1, 3)
 
     def held_columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """dx/dc, df/dc, dy/dc as (3N, 3K), (3K, 3K), (3N, 3K)."""
@@ -109,6 +126,8 @@ def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Fi
     hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
     M = _mixed_matrix(equilibria, rho, median, final.y)
     cold = _element_forces(equilibria, median.gradients, problem.glassy, final.y - median.x)
+    R_x = _density_columns(equilibria, _element_forces(equilibria, body.dN, hot, median.x - body.X))
+    R_y = _density_columns(equilibria, cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X))
     return Linearisation(
         held=held,
         free=free,
@@ -116,7 +135,9 @@ def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Fi
         free_fixed=equilibria.free_mask.fixed,
         M=M,
         MT=M.T.tobsr(blocksize=(3, 3)),
-        R_x=_density_columns(equilibria, _element_forces(equilibria, body.dN, hot, median.x - body.X)),
-        R_y=_density_columns(equilibria, cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X)),
+        R_x=R_x,
+        R_y=R_y,
+        R_xT=R_x.T,
+        R_yT=R_y.T,
         n_patches=equilibria.patches.count,
     )

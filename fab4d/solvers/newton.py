@@ -20,6 +20,9 @@ class Status(Enum):
     UNSTABLE = "the equilibrium is unstable: the tangent has too many negative eigenvalues"
 
 
+MAX_HALVINGS = 20
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """z (n,), why the solver stopped, the residual norm relative to its scale, iterations, steps cut by the domain."""
@@ -35,8 +38,22 @@ class Solution:
         return self.status is Status.CONVERGED
 
 
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """r (n,) and potential at one z, both infinite outside the domain; `scale` is what |r| is compared with."""
+
+    r: FloatArray
+    scale: float
+    potential: float
+
+    @property
+    def norm(self) -> float:
+        """Euclidean norm of r, inf outside the domain."""
+        return float(np.sqrt(self.r @ self.r)) if np.isfinite(self.potential) else np.inf
+
+
 def newton(
-    residual: Callable[[FloatArray], tuple[FloatArray, float]],
+    residual: Callable[[FloatArray], Residual],
     factor: Callable[[FloatArray], Factor],
     z: FloatArray,
     tolerance: float,
@@ -44,42 +61,39 @@ def newton(
     fallback: Callable[[FloatArray], Factor] | None = None,
     n_negative: int = 0,
 ) -> Solution:
-    """Solve residual(z) = 0.
+    """Solve residual(z) = 0, the stationary point of a potential.
 
-    residual : z -> (r (n,), scale); r is not finite outside the domain, scale is what |r|_max is compared with
     factor, fallback : z -> factor of the tangent; `fallback` is used where `factor` has more than `n_negative` negative
         eigenvalues, and must have `n_negative`
-    A step is halved until |r| falls or stays within the rounding of a converged state; each halving because of the domain
-    counts as guarded.
+    A step is halved until the residual or the potential falls; halvings because of the domain count as guarded.
     """
-    r, scale = residual(z)
-    norm, guarded = _norm(r), 0
+    at, guarded = residual(z), 0
     for iteration in range(max_iterations):
-        if norm <= tolerance * scale:
-            return Solution(z, Status.CONVERGED, norm / scale, iteration, guarded)
+        if at.norm <= tolerance * at.scale:
+            return Solution(z, Status.CONVERGED, at.norm / at.scale, iteration, guarded)
         try:
-            last = factor(z)
-            if fallback is not None and last.n_negative > n_negative:
-                last = fallback(z)
-            step = -last.solve(r)
+            tangent = factor(z)
+            if fallback is not None and tangent.n_negative > n_negative:
+                tangent = fallback(z)
+            step = -tangent.solve(at.r)
         except SingularMatrixError:
-            return Solution(z, Status.SINGULAR, norm / scale, iteration, guarded)
-        t = 1.0
-        for _ in range(30):
-            r_new, scale_new = residual(z + t * step)
-            norm_new = _norm(r_new)
-            if not np.isfinite(norm_new):
-                guarded += 1
-            elif norm_new <= (1 - 1e-4 * t) * norm or norm_new <= tolerance * scale_new:
+            return Solution(z, Status.SINGULAR, at.norm / at.scale, iteration, guarded)
+        t, slope = 1.0, float(at.r @ step)
+        for _ in range(MAX_HALVINGS):
+            new = residual(z + t * step)
+            guarded += not np.isfinite(new.potential)
+            if _improves(new, at, t, slope, tolerance):
                 break
             t *= 0.5
         else:
-            return Solution(z, Status.NO_STEP, norm / scale, iteration, guarded)
-        z, r, norm, scale = z + t * step, r_new, norm_new, scale_new
-    status = Status.CONVERGED if norm <= tolerance * scale else Status.MAX_ITERATIONS
-    return Solution(z, status, norm / scale, max_iterations, guarded)
+            return Solution(z, Status.NO_STEP, at.norm / at.scale, iteration, guarded)
+        z, at = z + t * step, new
+    status = Status.CONVERGED if at.norm <= tolerance * at.scale else Status.MAX_ITERATIONS
+    return Solution(z, status, at.norm / at.scale, max_iterations, guarded)
 
 
-def _norm(r: FloatArray) -> float:
-    # The Euclidean norm, not the largest entry: near a held point the largest entry may rise on a good step.
-    return float(np.sqrt(r @ r)) if np.all(np.isfinite(r)) else np.inf
+def _improves(new: Residual, old: Residual, t: float, slope: float, tolerance: float) -> bool:
+    if new.norm <= max((1 - 1e-4 * t) * old.norm, tolerance * new.scale):
+        return True
+    # Armijo's rule, for descent directions only; far from the solution the residual may have to rise first.
+    return slope < 0 and new.potential <= old.potential + 1e-4 * t * slope

@@ -1,0 +1,190 @@
+"""The reduced solver: density and held positions as unknowns, every iterate in exact equilibrium (solver.md section 1)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from fab4d.design.equilibria import Equilibria, Final, Median
+from fab4d.design.gauss_newton import Design, equilibrate, evaluate, gauss_newton_step, held_positions
+from fab4d.design.objective import ObjectiveWeights, smoothness_matrix
+from fab4d.design.patches import Patches, build_patches, spread_centers
+from fab4d.design.problem import Problem
+from fab4d.errors import EquilibriumError
+from fab4d.mesh.tetmesh import FloatArray
+
+START_DENSITY = 0.6
+UNDECIDED = (1e-3, 1 - 1e-3)
+
+
+@dataclass(frozen=True)
+class ReducedSettings:
+    """Number and radius (L0) of the patches, the objective, and how long each phase may go on."""
+
+    n_points: int
+    patch_radius: float
+    weights: ObjectiveWeights
+    max_smp_fraction: float = 1.0
+    relax_iterations: int = 15
+    round_iterations: int = 40
+    undecided_fraction: float = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """What the solver shows after each accepted step."""
+
+    phase: str
+    equilibria: Equilibria
+    design: Design
+
+
+Watch = Callable[[Iterate], None]
+
+
+def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, start: Iterate | None = None) -> Iterate:
+    """A near 0/1 design that brings the final shape to X_temp with `n_points` held patches.
+
+    start : the last iterate of an interrupted run, to go on from
+    Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
+    """
+    L = smoothness_matrix(problem)
+    if start is None:
+        equilibria, design = first_design(problem, settings)
+        start = Iterate("start", equilibria, design)
+        watch(start)
+    if start.phase in ("start", "relax"):
+        start = relax(start, settings, L, watch)
+    return round_density(start, settings, L, watch)
+
+
+# -- start ---------------------------------------------------------------------------------------------------------------
+
+
+def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibria, Design]:
+    """The points held where the wanted shape has them, everything else relaxed from X_temp.
+
+    When that fails, four times as many points are held first, then those are let go.
+    """
+    rho, x = np.full(problem.n_tets, START_DENSITY), problem.X_temp
+    equilibria = Equilibria(problem, spread_patches(problem, settings.n_points, settings.patch_radius))
+    median = _relaxed(equilibria, rho, x)
+    if not median.solution.converged:
+        dense = equilibria.with_patches(spread_patches(problem, 4 * settings.n_points, settings.patch_radius))
+        median = _relaxed(equilibria, rho, _relaxed(dense, rho, x).x)
+    if not median.solution.converged:
+        msg = (
+            f"no equilibrium near the temporary shape with {equilibria.patches.count} points held "
+            f"({median.solution.status.value}): allow more points ([goal] max_forces)"
+        )
+        raise EquilibriumError(msg)
+    final = equilibria.solve_final(rho, median, median.x, max_iterations=100)
+    if not final.solution.converged:
+        msg = f"the first design finds no final shape ({final.solution.status.value}): check the temporary shape"
+        raise EquilibriumError(msg)
+    return equilibria, Design(rho, held_positions(equilibria, median), median, final)
+
+
+def _relaxed(equilibria: Equilibria, rho: FloatArray, x: FloatArray) -> Median:
+    """The median shape reached from x with the patches held where x has them."""
+    patches = equilibria.patches
+    return equilibria.solve_median(rho, patches.mean(x), x, np.zeros((patches.count, 3)), max_iterations=100)
+
+
+def spread_patches(problem: Problem, count: int, radius: float) -> Patches:
+    """`count` patches spread over the body, or as many as it has room for."""
+    return build_patches(problem, spread_centers(problem, count), radius)
+
+
+# -- phases --------------------------------------------------------------------------------------------------------------
+
+
+def relax(at: Iterate, settings: ReducedSettings, L: csr_array, watch: Watch) -> Iterate:
+    """Gauss-Newton on the relaxed density until the objective falls by less than 2 % in two steps running."""
+    design, weights, damping, slow = at.design, settings.weights, 0.3, 0
+    value = evaluate(at.equilibria, weights, L, design)
+    for _ in range(settings.relax_iterations):
+        step = gauss_newton_step(at.equilibria, weights, L, design, damping)
+        if not step.accepted:
+            break
+        slow = slow + 1 if step.value > 0.98 * value else 0
+        design, value, damping = step.design, step.value, step.damping
+        watch(Iterate("relax", at.equilibria, design))
+        if slow == 2:
+            break
+    return Iterate("relax", at.equilibria, design)
+
+
+def round_density(at: Iterate, settings: ReducedSettings, L: csr_array, watch: Watch) -> Iterate:
+    """Raise lam_round until all but a few densities are 0 or 1, held positions following."""
+    v = at.equilibria.problem.volume_fractions
+    design, weights, damping = at.design, settings.weights.replace(lam_round=0.02), 0.3
+    for _ in range(settings.round_iterations):
+        if v @ design.rho > settings.max_smp_fraction:
+            weights = weights.replace(lam_SMP=1.5 * weights.lam_SMP)
+        step = gauss_newton_step(at.equilibria, weights, L, design, damping)
+        design, damping = step.design, min(step.damping, 30.0)
+        if step.accepted:
+            watch(Iterate("round", at.equilibria, design))
+        if undecided_fraction(design.rho) <= settings.undecided_fraction:
+            break
+        weights = weights.replace(lam_round=1.6 * weights.lam_round)
+    return Iterate("round", at.equilibria, design)
+
+
+def undecided_fraction(rho: FloatArray) -> float:
+    """Share of tets whose density is neither 0 nor 1."""
+    return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
+
+
+# -- refit ---------------------------------------------------------------------------------------------------------------
+
+
+def change_density(equilibria: Equilibria, design: Design, rho: FloatArray) -> Design:
+    """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
+
+    Raises EquilibriumError when the path ends before.
+    """
+    start, done, step = design.rho, 0.0, 1.0
+    held = held_positions(equilibria, design.median)
+    while done < 1.0:
+        aim = min(1.0, done + step)
+        mixed = start + aim * (rho - start)
+        trial = equilibrate(equilibria, mixed, held, design.median.x, design.median.forces, design.final.y)
+        if trial is not None:
+            design, done, step = trial, aim, 2 * step
+        else:
+            step /= 2
+        if step < 1e-3:
+            msg = "the printed labels have no equilibrium near that of the relaxed design"
+            raise EquilibriumError(msg)
+    return design
+
+
+def refit(equilibria: Equilibria, design: Design, weights: ObjectiveWeights, watch: Watch, iterations: int = 12) -> Design:
+    """Held positions that are best for the design's fixed density; the density does not move."""
+    problem = equilibria.problem
+    weights = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
+    L = smoothness_matrix(problem)
+    fixed = np.zeros(problem.n_tets, bool)
+    damping, value = 1e-3, evaluate(equilibria, weights, L, design)
+    for _ in range(iterations):
+        step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed)
+        if not step.accepted:
+            break
+        slow = step.value > (1 - 1e-4) * value
+        design, damping, value = step.design, step.damping, step.value
+        watch(Iterate("refit", equilibria, design))
+        if slow:
+            break
+    return design
+
+
+def polished(equilibria: Equilibria, design: Design, tolerance: float = 1e-12) -> Design:
+    """The same design with both equilibria solved as far as rounding allows."""
+    median: Median = equilibria.solve_median(
+        design.rho, held_positions(equilibria, design.median), design.median.x, design.median.forces, tolerance
+    )
+    final: Final = equilibria.solve_final(design.rho, median, design.final.y, tolerance)
+    return replace(design, median=median, final=final)
