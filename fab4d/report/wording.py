@@ -34,3 +34,8 @@ def scale_words(scale: float) -> str:
 def kelvin(temperature: float) -> str:
     """A temperature in K, with degrees Celsius in brackets."""
     return f"{number(temperature, 0)} K ({number(temperature - 273.15, 0)} °C)"
+
+
+def plain(value: float) -> str:
+    """`value` to four digits, short."""
+    return f"{value:.4g}"

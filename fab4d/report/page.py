@@ -1,0 +1,169 @@
+"""report.html: one file with verdict, figures, turnable view, checks and origin, readable without a network."""
+
+import base64
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.mesh.topology import face_table
+from fab4d.report.metrics import Shapes, final_as_wanted
+from fab4d.report.verdict import ACCEPTED, Check
+from fab4d.report.wording import plain
+
+ASSETS = files("fab4d.report") / "assets"
+
+
+def report_page(
+    name: str, report: Mapping[str, Any], checks: Sequence[Check], scene: Mapping[str, Any], plot: bytes | None
+) -> bytes:
+    """The page of part `name`.
+
+    report : report.json      scene : from `view_data`      plot : PNG of error against run time, None without a solver
+    """
+    text = Template(_asset("page.html")).substitute(
+        title=escape(name),
+        css=_asset("page.css"),
+        verdict=report["verdict"],
+        verdict_class=report["verdict"].lower(),
+        reasons=_bullets(report["reasons"]) if report["verdict"] != ACCEPTED else "",
+        figures=_figures(report),
+        checks=_checks(checks),
+        plot=_image(plot),
+        forces=_forces(scene["points"]),
+        stages=_stages(report),
+        left_out=_bullets(f"{item['what']}: {item['why']}" for item in report["left_out"]),
+        origin=_origin(report),
+        # "</script>" inside a name would end the element.
+        data=json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
+        three=_asset("three.min.js"),
+        viewer=_asset("viewer.js"),
+    )
+    return text.encode()
+
+
+def view_data(shapes: Shapes, tets: IntArray, smp: np.ndarray, clamp: np.ndarray, state: Any) -> dict[str, Any]:
+    """What the viewer draws: only the vertices of the outer surface and of the SMP body, as base64 arrays.
+
+    tets : (m, 4)       smp : (m,) bool      clamp : (n,) bool       state : the verified state, or None
+    """
+    bodies = {"outer": shapes.faces, "smp": face_table(tets[smp]).boundary}
+    bodies["clamp"] = shapes.faces[clamp[shapes.faces].all(axis=1)]
+    used = np.unique(np.concatenate([faces.ravel() for faces in bodies.values()]))
+    renumber = np.full(len(shapes.X), -1, np.int64)
+    renumber[used] = np.arange(len(used))
+    positions = {"permanent": shapes.X, "median": shapes.x, "final": final_as_wanted(shapes), "wanted": shapes.X_temp}
+    return (
+        {key: _packed(faces, renumber) for key, faces in bodies.items()}
+        | {key: _base64(x[used].astype("<f4")) for key, x in positions.items()}
+        | {"points": [] if state is None else _points(state, renumber)}
+    )
+
+
+def _points(state: Mapping[str, np.ndarray], renumber: IntArray) -> list[dict[str, Any]]:
+    sizes = np.linalg.norm(state["patch_force"], axis=1)
+    return [
+        {
+            "vertex": int(renumber[vertex]),
+            "size": float(size),
+            "direction": (force / (size or 1.0)).tolist(),
+            "hold": held.tolist(),
+        }
+        for vertex, force, size, held in zip(
+            state["patch_center"], state["patch_force"], sizes, state["patch_held"], strict=True
+        )
+    ]
+
+
+def _packed(faces: IntArray, renumber: IntArray) -> str:
+    return _base64(renumber[faces].astype("<u4"))
+
+
+def _base64(array: FloatArray | IntArray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _asset(name: str) -> str:
+    return (ASSETS / name).read_text(encoding="utf-8")
+
+
+def _figures(report: Mapping[str, Any]) -> str:
+    error, residual = report["error"], report["equilibrium_residual"]
+    shown = {
+        "RMS error": f"{plain(error['rms_mm'])} mm",
+        "RMS error, of the diagonal": plain(error["rms_rel"]),
+        "largest error": f"{plain(error['max_mm'])} mm",
+        "Hausdorff distance": f"{plain(error['hausdorff_mm'])} mm",
+        "prescribed displacement, RMS": f"{plain(report['target_displacement_mm'])} mm",
+        "SMP share of the volume": plain(report["smp_fraction"]),
+        "forces": str(report["forces"]),
+        "fixity": _or_dash(report["fixity"]),
+        "undesired deformation": _or_dash(report["undesired_deformation"]),
+        "smallest det F": _or_dash(report["min_det_F"]),
+        "residual, median / final": f"{_or_dash(residual['median'])} / {_or_dash(residual['final'])}",
+        "mass": f"{plain(report['mass_g'])} g",
+        "material": f"{plain(report['cost_usd'])} USD",
+        "run time": f"{plain(report['wall_s'])} s",
+    }
+    return "".join(f"<div><span>{escape(k)}</span><strong>{escape(v)}</strong></div>" for k, v in shown.items())
+
+
+def _or_dash(value: float | None) -> str:
+    return "–" if value is None else plain(value)
+
+
+def _checks(checks: Sequence[Check]) -> str:
+    rows = "".join(
+        f'<tr class="{"passed" if c.passed else "failed"}"><td>{escape(c.name)}</td><td>{escape(c.found)}</td>'
+        f"<td>{escape(c.allowed)}</td><td>{'holds' if c.passed else 'fails'}</td></tr>"
+        for c in checks
+    )
+    return f"<table><tr><th>what</th><th>found</th><th>allowed</th><th></th></tr>{rows}</table>"
+
+
+def _forces(points: Sequence[Mapping[str, Any]]) -> str:
+    if not points:
+        return "<p>None: there is nothing to program.</p>"
+    rows = "".join(
+        f'<tr><td>{k}</td><td class="number">{plain(p["size"])}</td><td>{_triple(p["direction"], 3)}</td>'
+        f"<td>{_triple(p['hold'], 1)}</td></tr>"
+        for k, p in enumerate(points, 1)
+    )
+    head = '<tr><th>no</th><th class="number">N</th><th>direction</th><th>held at, mm</th></tr>'
+    return f"<table>{head}{rows}</table><p>All that the bench needs is in rig/rig-sheet.pdf and rig/forces.csv.</p>"
+
+
+def _triple(vector: Sequence[float], decimals: int) -> str:
+    return ", ".join(f"{v:z.{decimals}f}" for v in vector)
+
+
+def _stages(report: Mapping[str, Any]) -> str:
+    rows = "".join(
+        f'<tr><td>{escape(s["name"])}</td><td class="number">{s["wall_s"]:.2f}</td>'
+        f'<td class="number">{"–" if s["tau"] is None else format(s["tau"], ".0f")}</td></tr>'
+        for s in report["stages"]
+    )
+    head = '<tr><th>stage</th><th class="number">s</th><th class="number">factorisations (tau)</th></tr>'
+    return f"<table>{head}{rows}</table>"
+
+
+def _origin(report: Mapping[str, Any]) -> str:
+    rows = [*report["inputs"].items(), *report["versions"].items()]
+    cells = "".join(f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in rows)
+    return f"<table>{cells}</table>"
+
+
+def _bullets(lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else "<p>Nothing.</p>"
+
+
+def _image(png: bytes | None) -> str:
+    if png is None:
+        return "<p>Nothing was solved.</p>"
+    return f'<img alt="error against run time" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

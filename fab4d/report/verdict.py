@@ -1,0 +1,83 @@
+"""The verdict: every check with its value, its limit and, when it fails, the reason to print first."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fab4d.report.wording import plain
+
+ACCEPTED, REJECTED = "ACCEPTED", "REJECTED"
+LARGEST_RESIDUAL = 1e-8
+"""Largest residual of an equilibrium, relative to the largest force."""
+DEFAULT_TOLERANCE = 5e-3
+"""Largest RMS error when the scene states none, relative to the diagonal."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was checked, what was found and allowed (as words), and whether it holds."""
+
+    name: str
+    found: str
+    allowed: str
+    passed: bool
+
+    @property
+    def reason(self) -> str:
+        return f"{self.name} is {self.found}, allowed is {self.allowed}"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a design must keep. tolerance in mm; None: not limited."""
+
+    tolerance: float
+    max_forces: int
+    max_smp_fraction: float | None
+    max_ambiguous_fraction: float
+    max_isolated_fraction: float
+
+
+def checks_of(figures: Mapping[str, Any], limits: Limits) -> list[Check]:
+    """The checks of the figures of report.json; a figure that was not measured (None) is not checked."""
+    residual = figures["equilibrium_residual"]
+    found = [
+        _at_most("RMS error", figures["error"]["rms_mm"], limits.tolerance, " mm"),
+        _at_most("number of forces", figures["forces"], limits.max_forces),
+        _at_most("SMP share of the volume", figures["smp_fraction"], limits.max_smp_fraction),
+        _below("share of ambiguous tets", figures["ambiguous_fraction"], limits.max_ambiguous_fraction),
+        _below("share of isolated SMP tets", figures["isolated_fraction"], limits.max_isolated_fraction),
+        _at_most("equilibrium residual of the median shape", residual["median"], LARGEST_RESIDUAL),
+        _at_most("equilibrium residual of the final shape", residual["final"], LARGEST_RESIDUAL),
+        _above("smallest det F", figures["min_det_F"], 0.0),
+    ]
+    return [check for check in found if check is not None]
+
+
+def reasons_of(checks: list[Check], reports: Mapping[str, Mapping[str, Any] | None]) -> list[str]:
+    """Why the design is rejected: failed checks, then what the stages say, each once; empty when it is accepted."""
+    said = [r for report in reports.values() if report for r in report.get("reasons", [])]
+    verify = reports.get("verify_report")
+    if verify and not verify["reached"]:
+        said.insert(0, "the forward simulation from the permanent shape did not reach the designed state")
+    return list(dict.fromkeys([c.reason for c in checks if not c.passed] + said))
+
+
+def left_out_of(reports: Mapping[str, Mapping[str, Any] | None]) -> list[dict[str, str]]:
+    """What all stages left out, in their order, each once."""
+    items = [item for report in reports.values() if report for item in report.get("left_out", [])]
+    return [{"what": what, "why": why} for what, why in dict.fromkeys((i["what"], i["why"]) for i in items)]
+
+
+def _at_most(name: str, value: float | None, limit: float | None, unit: str = "") -> Check | None:
+    if value is None or limit is None:
+        return None
+    return Check(name, plain(value) + unit, f"at most {plain(limit)}{unit}", value <= limit)
+
+
+def _below(name: str, value: float | None, limit: float) -> Check | None:
+    return None if value is None else Check(name, plain(value), f"below {plain(limit)}", value < limit)
+
+
+def _above(name: str, value: float | None, limit: float) -> Check | None:
+    return None if value is None else Check(name, plain(value), f"above {plain(limit)}", value > limit)

@@ -1,0 +1,128 @@
+"""Stage `report`: the verdict with its reasons, the figures, the traces, the verified state and the page."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fab4d.io.meshes import vtu_bytes
+from fab4d.mesh.measures import bounding_box_diagonal
+from fab4d.report import metrics
+from fab4d.report.page import report_page, view_data
+from fab4d.report.trace import joined_trace, trace_csv, trace_plot
+from fab4d.report.verdict import ACCEPTED, DEFAULT_TOLERANCE, REJECTED, Limits, checks_of, left_out_of, reasons_of
+from fab4d.stages.monitor import Monitor
+
+REPORTS = (
+    "check_report",
+    "solve_report",
+    "threshold_report",
+    "refit_report",
+    "verify_report",
+    "bodies_report",
+    "rig_report",
+)
+
+
+def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
+    """Everything that a person or a program reads about a finished design."""
+    monitor.progress("figures")
+    mesh, state, smp = inputs["mesh"], inputs["state"], _printed_labels(inputs)
+    shapes, reports = metrics.shapes_of(mesh, state), {name: inputs[name] for name in REPORTS}
+    limits = _limits(profile, bounding_box_diagonal(mesh["X"]))
+    figures = _figures(inputs, profile, shapes, smp)
+    checks = checks_of(figures, limits)
+    reasons = reasons_of(checks, reports)
+    verdict = REJECTED if reasons else ACCEPTED
+    report = {"verdict": verdict, "reasons": reasons} | figures | _origin(inputs, reports)
+    monitor.progress("page", rms_mm=figures["error"]["rms_mm"])
+    rows = joined_trace({s: inputs[f"{s}_trace"] for s in ("solve", "refit")}, inputs["run"]["stages"], report["tau_s"])
+    plot = trace_plot(rows, limits.tolerance) if rows else None
+    view = view_data(shapes, mesh["tets"], smp, mesh["clamp"], state)
+    return {
+        "report_json": report,
+        "error_vs_time": trace_csv(rows) if rows else None,
+        "error_plot": plot,
+        "design_vtu": _design_vtu(inputs, smp),
+        "report_html": report_page(profile["name"], report, checks, view, plot),
+    }
+
+
+def _printed_labels(inputs: Mapping[str, Any]) -> np.ndarray:
+    """(m,) bool: what is printed in SMP; nothing where nothing is to be programmed."""
+    labels = inputs["labels"]
+    return np.zeros(len(inputs["mesh"]["tets"]), bool) if labels is None else labels["smp"].astype(bool)
+
+
+def _limits(profile: Mapping[str, Any], L0: float) -> Limits:
+    goal, acceptance = profile["goal"], profile["acceptance"]
+    return Limits(
+        tolerance=DEFAULT_TOLERANCE * L0 if goal.tolerance is None else goal.tolerance,
+        max_forces=profile["rig"].max_points if goal.max_forces is None else goal.max_forces,
+        max_smp_fraction=goal.max_smp_fraction,
+        max_ambiguous_fraction=acceptance.max_ambiguous_fraction,
+        max_isolated_fraction=acceptance.max_isolated_fraction,
+    )
+
+
+def _figures(
+    inputs: Mapping[str, Any], profile: Mapping[str, Any], shapes: metrics.Shapes, smp: np.ndarray
+) -> dict[str, Any]:
+    mesh, threshold, verify = inputs["mesh"], inputs["threshold_report"] or {}, inputs["verify_report"] or {}
+    mass, cost = metrics.mass_and_cost(mesh, smp, profile["materials"])
+    return {
+        "error": metrics.error_figures(metrics.final_error(shapes), bounding_box_diagonal(shapes.X)),
+        "target_displacement_mm": metrics.target_displacement(shapes).rms,
+        "smp_fraction": metrics.smp_fraction(mesh, smp),
+        "forces": metrics.force_count(inputs["state"]),
+        "ambiguous_fraction": threshold.get("ambiguous_fraction"),
+        "isolated_fraction": threshold.get("isolated_fraction"),
+        "fixity": metrics.fixity(shapes),
+        "undesired_deformation": metrics.undesired_deformation(shapes),
+        "equilibrium_residual": verify.get("equilibrium_residual", {"median": None, "final": None}),
+        "min_det_F": verify.get("min_det_F"),
+        "element_order": verify.get("element_order"),
+        "mass_g": mass,
+        "cost_usd": cost,
+    }
+
+
+def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, Any]:
+    run, tau_s = inputs["run"], (inputs["solve_report"] or {}).get("tau_s")
+    stages = [
+        {"name": s["name"], "wall_s": s["wall_s"], "tau": s["wall_s"] / tau_s if tau_s else None} for s in run["stages"]
+    ]
+    return {
+        "tau_s": tau_s,
+        "wall_s": run["wall_s"],
+        "peak_rss_mb": run["peak_rss_mb"],
+        "left_out": left_out_of(reports),
+        "stages": stages,
+        "versions": run["versions"],
+        "inputs": run["inputs"],
+    }
+
+
+def _design_vtu(inputs: Mapping[str, Any], smp: np.ndarray) -> bytes:
+    """The verified state as it stands; without one, the part at rest."""
+    mesh, labels, relaxed = inputs["mesh"], inputs["labels"], inputs["relaxed"]
+    state = inputs["state"] if inputs["state"] is not None else _at_rest(mesh)
+    point_data = {
+        "median": state["x"],
+        "temporary": state["y"],
+        "force": state["force"],
+        "held": state["held"].astype(np.int64),
+        "clamp": state["clamp"].astype(np.int8),
+    }
+    cell_data = {
+        "smp": smp.astype(np.int8),
+        "rho": smp.astype(float) if relaxed is None else relaxed["rho"],
+        "cluster": smp.astype(np.int64) if labels is None else labels["cluster"].astype(np.int64),
+    }
+    return vtu_bytes(state["nodes"], state["elements"], point_data, cell_data)
+
+
+def _at_rest(mesh: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    X, n = mesh["X"], len(mesh["X"])
+    still = {"nodes": X, "x": X, "y": X, "elements": mesh["tets"], "clamp": mesh["clamp"]}
+    return still | {"force": np.zeros((n, 3)), "held": np.full(n, -1)}

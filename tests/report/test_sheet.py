@@ -1,0 +1,151 @@
+"""The drawing under the rig sheet: depth, labels, words; and the sheet as a file."""
+
+import re
+import zlib
+from base64 import a85decode
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fab4d.mesh.topology import face_table
+from fab4d.report.labels import place_labels
+from fab4d.report.views import FRAMES, Figure, fitted, hidden_points, picture
+from fab4d.report.wording import number, printable, scale_words, significant
+from fab4d.report.zbuffer import render
+from fab4d.stages.monitor import SilentMonitor
+from fab4d.stages.rig import run
+
+
+@pytest.fixture
+def rig_run(bar, profile):
+    def go(state, name="bent-bar"):
+        inputs = {"mesh": bar.mesh_artifact(), "labels": bar.labels_artifact(), "state": state}
+        return run(inputs, profile | {"name": name}, SilentMonitor())
+
+    return go
+
+
+def pdf_text(pdf: bytes) -> str:
+    """All strings of the page streams, as reportlab writes them: ASCII85 over zlib."""
+    streams = re.findall(rb"stream\r?\n(.*?)~>\s*endstream", pdf, re.DOTALL)
+    drawn = [zlib.decompress(a85decode(stream)) for stream in streams]
+    return "\n".join(s.decode("cp1252") for page in drawn for s in re.findall(rb"\((.*?)\) Tj", page))
+
+
+def test_the_nearest_face_is_seen():
+    points = np.array([[0, 0, 1], [10, 0, 1], [0, 10, 1], [0, 0, 2], [4, 0, 2], [0, 4, 2.0]])
+    seen = render(points, np.array([[0, 1, 2], [3, 4, 5]]), 10, 10)
+    assert seen.face[0, 0] == 1
+    assert seen.face[4, 4] == 0
+    assert seen.face[9, 9] == -1
+    assert seen.depth[0, 0] == pytest.approx(2)
+
+
+def test_pixels_of_a_triangle_add_up_to_its_area():
+    points = np.array([[3.0, 5, 0], [180, 20, 0], [60, 190, 0]])
+    area = 0.5 * abs(np.cross(points[1] - points[0], points[2] - points[0])[2])
+    assert (render(points, np.array([[0, 1, 2]]), 200, 200).face >= 0).sum() == pytest.approx(area, rel=0.01)
+
+
+def test_frames_are_right_handed():
+    for frame in FRAMES:
+        np.testing.assert_allclose(np.cross(frame.axes[0], frame.axes[1]), frame.axes[2])
+
+
+def test_points_behind_the_part_are_hidden(bar):
+    X, tets = bar.box()
+    faces = face_table(tets).boundary
+    figure = Figure(X, X, faces, faces[:0], faces[:0])
+    front = fitted(FRAMES[1], X)
+    sides = np.array([[3.75, 0.0, 15.0], [3.75, 7.5, 15.0]])
+    assert hidden_points(figure, front, sides).tolist() == [False, True]
+
+
+def test_picture_shows_smp_clamp_and_ghost(bar):
+    X, tets = bar.box()
+    faces = face_table(tets).boundary
+    smp = face_table(tets[bar.labels_artifact()["smp"]]).boundary
+    foot = faces[(X[faces][:, :, 2] == 0).all(axis=1)]
+    x = bar.bent(X, bar.MEDIAN)
+    with_smp = picture(Figure(X, x, faces, smp, foot), fitted(FRAMES[0], X, x), 8.0)
+    without = picture(Figure(X, x, faces, smp[:0], foot[:0]), fitted(FRAMES[0], X, x), 8.0)
+    red = with_smp.astype(int)[..., 0] - with_smp[..., 2]
+    assert (with_smp != without).any(axis=2).mean() > 0.2
+    assert (red > 60).any()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 16), st.integers(0, 2**31))
+def test_labels_do_not_overlap(count, seed):
+    rng = np.random.default_rng(seed)
+    anchors = rng.uniform(15, 55, (count, 2))
+    away = rng.normal(size=(count, 2))
+    centers = place_labels(anchors, away, np.zeros((0, 2, 2)), 2.3, (70.0, 70.0))
+    gaps = np.linalg.norm(centers[:, None] - centers, axis=2) + 1e9 * np.eye(count)
+    assert gaps.min() >= 4.6 - 1e-9
+    assert centers.min() >= 2.3
+    assert centers.max() <= 70 - 2.3
+
+
+def test_labels_keep_off_lines():
+    lines = np.array([[[0.0, 20.0], [40.0, 20.0]]])
+    center = place_labels(np.array([[20.0, 20.0]]), np.array([[1.0, 0]]), lines, 2.0, (40.0, 40.0))[0]
+    assert abs(center[1] - 20) >= 2.0 - 1e-9
+
+
+@given(st.floats(-1e6, 1e6), st.integers(0, 3))
+def test_numbers_are_never_negative_zero(value, decimals):
+    words = number(value, decimals)
+    assert not re.fullmatch(r"-0\.?0*", words)
+    assert float(words) == pytest.approx(value, abs=0.5 * 10**-decimals + 1e-9)
+
+
+def test_words():
+    assert [significant(v) for v in (0, 0.01234, 1.234, 98.07, 12345.6)] == ["0.00", "0.0123", "1.23", "98.1", "12346"]
+    assert scale_words(2.5) == "2.50 : 1"
+    assert scale_words(0.25) == "1 : 4.00"
+    assert printable("äö 中") == "äö ?"
+
+
+def test_sheet_says_what_the_bench_needs(bar, rig_run):
+    sheet = rig_run(bar.state_artifact())["rig_sheet"]
+    assert sheet.startswith(b"%PDF")
+    text = pdf_text(sheet)
+    for words in (
+        "Rig sheet: bent-bar",
+        "348 K",
+        "308 K",
+        "10.0",
+        "98.1",
+        "Clamp and mark",
+        "Caliper",
+        "Positions locked",
+    ):
+        assert words in text
+    assert not re.search(r"(?<![\d.])-0\.?0*(?![\d.])", text)
+
+
+def test_equal_states_give_equal_bytes(bar, rig_run):
+    first, second = rig_run(bar.state_artifact()), rig_run(bar.state_artifact())
+    assert first["rig_sheet"] == second["rig_sheet"]
+    assert first["forces_csv"] == second["forces_csv"]
+    other = bar.state_artifact(forces=np.ones((3, 3)))
+    assert rig_run(other)["rig_sheet"] != first["rig_sheet"]
+
+
+def test_nothing_to_program_gives_no_sheet(bar, rig_run):
+    state = bar.state_artifact()
+    state |= {"patch_center": state["patch_center"][:0], "patch_force": np.zeros((0, 3))}
+    for nothing in (None, state):
+        result = rig_run(nothing)
+        assert result["rig_sheet"] is None
+        assert result["forces_csv"] is None
+        assert "nothing to program" in result["rig_report"]["left_out"][0]["why"]
+
+
+def test_forces_beyond_the_rig_are_said_on_the_sheet(bar, rig_run):
+    result = rig_run(bar.state_artifact(forces=np.diag([1.0, 1.0, 3e5])))
+    assert "point 3 needs 3e+05 N" in result["rig_report"]["reasons"][0]
+    assert "NOT POSSIBLE ON THIS RIG" in pdf_text(result["rig_sheet"])
