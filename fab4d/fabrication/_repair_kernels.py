@@ -1,0 +1,299 @@
+"""Compiled local search that makes the labels of a tet mesh well composed. `wellcomposed.py` explains it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from fab4d.fabrication._links import Links
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+FREE, LOCK_STEPS, MOST_FLIPS, MOST_SKIPS = -1, 12, 6, 40
+
+
+class State(NamedTuple):
+    """What the search changes. `only` (1,): FREE, or the one label whose tets may flip."""
+
+    smp: BoolArray
+    original: BoolArray
+    cost: FloatArray
+    pinched: BoolArray
+    defects: IntArray
+    flips: IntArray
+    locked_until: IntArray
+    only: IntArray
+
+
+class Scratch(NamedTuple):
+    """Work space, as long as the largest star."""
+
+    bits: BoolArray
+    degree: IntArray
+    parent: IntArray
+    group: IntArray
+    stamp: IntArray
+    """(n + 1,) the last entry counts."""
+    members: IntArray
+    best: IntArray
+
+
+class Queue(NamedTuple):
+    """A double-ended queue of vertices in a ring; `ends` (2,): bottom and number of entries."""
+
+    ring: IntArray
+    waiting: BoolArray
+    ends: IntArray
+
+
+@njit(cache=True)
+def _root(parent: IntArray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@njit(cache=True)
+def _boundary_excess(v: int, value: bool, links: Links, scratch: Scratch) -> int:
+    """How far the boundary of one material is from a single cycle in the link of v; fills scratch.degree."""
+    degree, parent, bits = scratch.degree, scratch.parent, scratch.bits
+    for i in range(links.n_nodes[v]):
+        degree[i] = 0
+        parent[i] = i
+    touched = joined = excess = 0
+    for e in range(links.edge_start[v], links.edge_start[v + 1]):
+        a, b = links.edge_tets[e]
+        if (bits[a] == value) != (b >= 0 and bits[b] == value):
+            i, j = links.edge_ends[e]
+            touched += (degree[i] == 0) + (degree[j] == 0)
+            degree[i] += 1
+            degree[j] += 1
+            i, j = _root(parent, i), _root(parent, j)
+            joined += i != j
+            parent[i] = j
+    for i in range(links.n_nodes[v]):
+        excess += max(0, degree[i] // 2 - 1)
+    return excess + max(0, touched - joined - 1)
+
+
+@njit(cache=True)
+def _load_bits(v: int, smp: BoolArray, links: Links, scratch: Scratch) -> None:
+    start = links.star_start[v]
+    for k in range(links.star_start[v + 1] - start):
+        scratch.bits[k] = smp[links.star[start + k]]
+
+
+@njit(cache=True)
+def vertex_defects(v: int, pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
+    """Surplus cycles and four-face edges of both materials at v; inside the part both have the same boundary.
+
+    Where the part itself is pinched, the defects are the tets to flip until one material is left.
+    """
+    _load_bits(v, smp, links, scratch)
+    if pinched[v]:
+        size = links.star_start[v + 1] - links.star_start[v]
+        n_smp = scratch.bits[:size].sum()
+        return min(n_smp, size - n_smp)
+    defects = _boundary_excess(v, True, links, scratch)
+    if links.on_surface[v]:
+        defects += _boundary_excess(v, False, links, scratch)
+    return defects
+
+
+@njit(cache=True)
+def all_defects(pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> IntArray:
+    """`vertex_defects` of every vertex (n,)."""
+    defects = np.zeros(len(links.n_nodes), np.int64)
+    for v in range(len(defects)):
+        defects[v] = vertex_defects(v, pinched, smp, links, scratch)
+    return defects
+
+
+@njit(cache=True)
+def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
+    """scratch.group: component of each tet of the star (equal labels, joined by faces); with node >= 0 at that edge."""
+    size = links.star_start[v + 1] - links.star_start[v]
+    parent, group, bits = scratch.parent, scratch.group, scratch.bits
+    for k in range(size):
+        parent[k] = k
+        group[k] = -1 if node >= 0 else 0
+    for e in range(links.edge_start[v], links.edge_start[v + 1]):
+        if node < 0 or links.edge_ends[e, 0] == node or links.edge_ends[e, 1] == node:
+            a, b = links.edge_tets[e]
+            group[a] = 0
+            if b >= 0:
+                group[b] = 0
+                if bits[a] == bits[b]:
+                    parent[_root(parent, a)] = _root(parent, b)
+    for k in range(size):
+        if group[k] == 0:
+            group[k] = _root(parent, k)
+
+
+@njit(cache=True)
+def _gather(v: int, group: int, links: Links, scratch: Scratch) -> int:
+    """The tets of one group into scratch.members; returns how many."""
+    start, count = links.star_start[v], 0
+    for k in range(links.star_start[v + 1] - start):
+        if scratch.group[k] == group:
+            scratch.members[count] = links.star[start + k]
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _flip(tets: IntArray, state: State) -> None:
+    for t in tets:
+        state.smp[t] = not state.smp[t]
+
+
+@njit(cache=True)
+def _fresh_stamp(scratch: Scratch) -> int:
+    scratch.stamp[-1] += 1
+    return scratch.stamp[-1]
+
+
+@njit(cache=True)
+def _change(tets: IntArray, state: State, links: Links, scratch: Scratch) -> int:
+    """Change of the number of defects when `tets` flip."""
+    _flip(tets, state)
+    stamp, change = _fresh_stamp(scratch), 0
+    for t in tets:
+        for u in links.vertices[t]:
+            if scratch.stamp[u] != stamp:
+                scratch.stamp[u] = stamp
+                change += vertex_defects(u, state.pinched, state.smp, links, scratch) - state.defects[u]
+    _flip(tets, state)
+    return change
+
+
+@njit(cache=True)
+def _allowed(tets: IntArray, step: int, state: State) -> bool:
+    only = state.only[0]
+    for t in tets:
+        if only == FREE:
+            if state.flips[t] >= MOST_FLIPS or state.locked_until[t] > step:
+                return False
+        elif state.smp[t] != (only == 1):
+            return False
+    return True
+
+
+@njit(cache=True)
+def _price(tets: IntArray, state: State) -> float:
+    """What a flip of `tets` costs: little where it brings the original label back."""
+    price = 0.0
+    for t in tets:
+        price += state.cost[t] * (1.0 if state.smp[t] == state.original[t] else 0.1)
+    return price
+
+
+@njit(cache=True)
+def _try(count: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
+    """`best` (rank, price, count), or the move scratch.members[:count] if it is better (kept in scratch.best)."""
+    tets = scratch.members[:count]
+    if not _allowed(tets, step, state):
+        return best
+    change = _change(tets, state, links, scratch)
+    price = _price(tets, state)
+    rank, price = (0, price / -change) if change < 0 else (1 + change, price)
+    if rank > best[0] or (rank == best[0] and price >= best[1]):
+        return best
+    scratch.best[:count] = tets
+    return rank, price, count
+
+
+@njit(cache=True)
+def _try_groups(v: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
+    size = links.star_start[v + 1] - links.star_start[v]
+    groups = scratch.group[:size].copy()
+    for k in range(size):
+        if groups[k] == k:
+            scratch.group[:size] = groups
+            count = _gather(v, k, links, scratch)
+            if count > 1:
+                best = _try(count, step, best, state, links, scratch)
+    return best
+
+
+@njit(cache=True)
+def _best_move(v: int, step: int, worst: int, state: State, links: Links, scratch: Scratch) -> int:
+    """The cheapest flip at v of rank below `worst` into scratch.best; returns its number of tets, 0 if there is none.
+
+    Moves: one tet of the star, one component of the star, one sector around a four-face edge.
+    """
+    best = (worst, 0.0, 0)
+    for k in range(links.star_start[v], links.star_start[v + 1]):
+        scratch.members[0] = links.star[k]
+        best = _try(1, step, best, state, links, scratch)
+    _load_bits(v, state.smp, links, scratch)
+    _group_tets(v, -1, links, scratch)
+    best = _try_groups(v, step, best, state, links, scratch)
+    for value in (True, False):
+        _load_bits(v, state.smp, links, scratch)
+        _boundary_excess(v, value, links, scratch)
+        degree = scratch.degree[: links.n_nodes[v]].copy()
+        for node in range(len(degree)):
+            if degree[node] > 2:
+                _load_bits(v, state.smp, links, scratch)
+                _group_tets(v, node, links, scratch)
+                best = _try_groups(v, step, best, state, links, scratch)
+    return best[2]
+
+
+@njit(cache=True)
+def _push(v: int, on_top: bool, queue: Queue) -> None:
+    if queue.waiting[v]:
+        return
+    queue.waiting[v] = True
+    if not on_top:
+        queue.ends[0] = (queue.ends[0] - 1) % len(queue.ring)
+    queue.ends[1] += 1
+    slot = queue.ends[0] + (queue.ends[1] - 1 if on_top else 0)
+    queue.ring[slot % len(queue.ring)] = v
+
+
+@njit(cache=True)
+def _pop(queue: Queue) -> int:
+    queue.ends[1] -= 1
+    v = queue.ring[(queue.ends[0] + queue.ends[1]) % len(queue.ring)]
+    queue.waiting[v] = False
+    return v
+
+
+@njit(cache=True)
+def _apply(count: int, step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> None:
+    tets = scratch.best[:count].copy()
+    _flip(tets, state)
+    stamp = _fresh_stamp(scratch)
+    for t in tets:
+        state.flips[t] += 1
+        state.locked_until[t] = step + LOCK_STEPS
+        for u in links.vertices[t]:
+            if scratch.stamp[u] != stamp:
+                scratch.stamp[u] = stamp
+                state.defects[u] = vertex_defects(u, state.pinched, state.smp, links, scratch)
+                if state.defects[u] > 0:
+                    _push(u, True, queue)
+
+
+@njit(cache=True)
+def search(state: State, links: Links, scratch: Scratch, queue: Queue) -> int:
+    """Flip tets until no vertex is defective or none can be helped; returns the defects left."""
+    skips = np.zeros(len(state.defects), np.int64)
+    for v in range(len(state.defects)):
+        if state.defects[v] > 0:
+            _push(v, True, queue)
+    step = 0
+    while queue.ends[1] > 0:
+        step += 1
+        v = _pop(queue)
+        if state.defects[v] == 0:
+            continue
+        count = _best_move(v, step, 1 + skips[v] if state.only[0] == FREE else 1 << 40, state, links, scratch)
+        if count > 0:
+            _apply(count, step, state, links, scratch, queue)
+        skips[v] += count == 0
+        if state.defects[v] > 0 and skips[v] < MOST_SKIPS:
+            _push(v, count > 0, queue)
+    return state.defects.sum()

@@ -1,0 +1,135 @@
+"""From the relaxed density to labels that can be printed: one material a tet, and what that changed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fab4d.fabrication.features import without_thin_places
+from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
+from fab4d.mesh.measures import tet_volumes
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray, frozen
+from fab4d.mesh.topology import component_labels, face_table
+
+AMBIGUOUS = 0.05, 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class LabelResult:
+    """Printable labels."""
+
+    smp: BoolArray
+    """(m,) whether each tet is SMP."""
+    cluster: IntArray
+    """(m,) 0 for TPE, 1.. for face-connected SMP clusters by falling volume."""
+    changed_fraction: dict[str, float]
+    """Volume fraction that each clean-up step changed; "total" against the labels given, after all steps."""
+    defects_left: IntArray
+    """(k,) vertices outside `part_defects` where the boundary of a material is still pinched."""
+    part_defects: IntArray
+    """(k,) vertices where the part's own surface is pinched: labels cannot help there."""
+
+
+def printable_labels(
+    X: FloatArray,
+    tets: IntArray,
+    rho_or_labels: FloatArray | BoolArray,
+    feature_xy: float,
+    feature_z: float,
+    flip_cost: FloatArray | None = None,
+) -> LabelResult:
+    """Labels near the given ones that both extruders can lay down as solid bodies.
+
+    X : (n, 3), mm        tets : (m, 4)        rho_or_labels : (m,) density in [0, 1], SMP above 0.5, or bool labels
+    feature_xy, feature_z : smallest feature across and along the build direction z, mm
+    flip_cost : (m,) cost of changing each tet while defects are repaired; None: its volume
+
+    Steps: clusters smaller than one feature go to the material around them, then places thinner than a feature do,
+    then labels are made well composed. Clusters are absorbed again after each later step.
+    """
+    rounded = rounded_labels(rho_or_labels)
+    volumes = np.abs(tet_volumes(X, tets))
+    cost = volumes if flip_cost is None else np.asarray(flip_cost, dtype=np.float64)
+    smallest = feature_xy * feature_xy * feature_z
+    steps = {"clusters": without_small_clusters(tets, volumes, rounded, smallest)}
+    opened = without_thin_places(X, tets, steps["clusters"], feature_xy, feature_z)
+    steps["features"] = without_small_clusters(tets, volumes, opened, smallest)
+    repaired = well_composed(tets, steps["features"], cost)
+    steps["well_composed"] = without_small_clusters(tets, volumes, repaired, smallest)
+    smp = steps["well_composed"]
+    changed = _changes(rounded, steps, volumes)
+    clusters = smp_clusters(tets, volumes, smp)
+    part_defects = pinched_vertices(tets)
+    defects = np.setdiff1d(pinched_vertices(tets, smp), part_defects)
+    return LabelResult(frozen(smp, np.bool_), frozen(clusters, np.int64), changed, defects, part_defects)
+
+
+def rounded_labels(rho_or_labels: FloatArray | BoolArray) -> BoolArray:
+    """SMP where the density (m,) is above 0.5; labels stay what they are."""
+    return np.asarray(rho_or_labels, dtype=np.float64) > 0.5
+
+
+def ambiguous_fraction(rho: FloatArray) -> float:
+    """Share of the tets, by count, with rho in [0.05, 0.95]. Source: the paper's first acceptance check."""
+    low, high = AMBIGUOUS
+    return float(np.mean((rho >= low) & (rho <= high)))
+
+
+def isolated_fraction(tets: IntArray, smp: BoolArray) -> float:
+    """Share of the SMP tets without a face-adjacent SMP tet; 0 without SMP. Source: the paper's second check."""
+    first, second = face_table(tets).interior_tets.T
+    together = smp[first] & smp[second]
+    joined = np.zeros(len(tets), bool)
+    joined[first[together]] = True
+    joined[second[together]] = True
+    isolated, total = int(np.sum(smp & ~joined)), int(np.sum(smp))
+    return isolated / max(1, total)
+
+
+def clusters_of(tets: IntArray, labels: BoolArray) -> IntArray:
+    """Number (m,) from 0 of the face-connected cluster of equal labels that each tet belongs to."""
+    pairs = face_table(tets).interior_tets
+    return component_labels(len(tets), pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]])
+
+
+def smp_clusters(tets: IntArray, volumes: FloatArray, smp: BoolArray) -> IntArray:
+    """0 for TPE, 1.. for the face-connected clusters of SMP by falling volume (equal ones by their first tet), (m,)."""
+    cluster = clusters_of(tets, smp)
+    names, first = np.unique(cluster[smp], return_index=True)
+    sizes = np.bincount(cluster, volumes).astype(np.float64)[names]
+    rank = np.zeros(int(cluster.max()) + 1, np.int64)
+    rank[names[np.lexsort([first, -sizes])]] = np.arange(1, len(names) + 1)
+    return np.where(smp, rank[cluster], 0)
+
+
+def without_small_clusters(tets: IntArray, volumes: FloatArray, smp: BoolArray, smallest: float) -> BoolArray:
+    """Labels (m,) whose clusters of either material below `smallest` (mm^3) went to the material around them.
+
+    A cluster with nothing around it (a piece of the part by itself) stays. Every absorption joins clusters, so it ends.
+    """
+    result = np.array(smp, dtype=bool)
+    part = component_labels(len(tets), face_table(tets).interior_tets)
+    changed = True
+    while changed:
+        changed = False
+        for label in (True, False):
+            small = _small_clusters(tets, volumes, result, part, smallest) & (result == label)
+            result[small] = not label
+            changed = changed or bool(small.any())
+    return result
+
+
+def _small_clusters(
+    tets: IntArray, volumes: FloatArray, labels: BoolArray, part: IntArray, smallest: float
+) -> BoolArray:
+    cluster = clusters_of(tets, labels)
+    surrounded = np.bincount(part)[part] > np.bincount(cluster)[cluster]
+    return surrounded & (np.bincount(cluster, volumes)[cluster] < smallest)
+
+
+def _changes(before: BoolArray, steps: dict[str, BoolArray], volumes: FloatArray) -> dict[str, float]:
+    total, rounded, changes = float(volumes.sum()), before, {}
+    for name, labels in steps.items():
+        changes[name] = float(volumes[labels != before].sum()) / total
+        before = labels
+    changes["total"] = float(volumes[before != rounded].sum()) / total
+    return changes
