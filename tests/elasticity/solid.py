@@ -125,6 +125,18 @@ def whole(pattern: SymmetricPattern, data: np.ndarray) -> csc_array:
     return csc_array(lower + tril(lower, -1).T)
 
 
+def nodal_areas(solid: Solid, on_face: np.ndarray) -> np.ndarray:
+    """(N,) integral of each shape function over the element faces whose nodes are all marked in `on_face`."""
+    share = np.zeros(len(solid.X))
+    for nodes in solid.body.elements:
+        corners = nodes[:4][on_face[nodes[:4]]]
+        if len(corners) == 3:
+            a, b, c = solid.X[corners]
+            loaded = corners if solid.body.order == 1 else nodes[4:][on_face[nodes[4:]]]
+            share[loaded] += 0.5 * np.linalg.norm(np.cross(b - a, c - a)) / 3
+    return share
+
+
 def dofs(nodes: np.ndarray, axes: tuple[int, ...] = (0, 1, 2)) -> np.ndarray:
     """Dof numbers of the given coordinates of nodes, given as numbers or as a mask."""
     nodes = np.flatnonzero(nodes) if nodes.dtype == bool else nodes
