@@ -29,7 +29,8 @@ def rig_run(bar, profile):
 
 def pdf_text(pdf: bytes) -> str:
     """All strings of the page streams, as reportlab writes them: ASCII85 over zlib."""
-    streams = re.findall(rb"stream\r?\n(.*?)~>\s*endstream", pdf, re.DOTALL)
+    objects = [o for o in re.findall(rb"\d+ 0 obj(.*?)endobj", pdf, re.DOTALL) if b"/Image" not in o]
+    streams = [found[1] for o in objects if (found := re.search(rb"stream\r?\n(.*?)~>\s*endstream", o, re.DOTALL))]
     drawn = [zlib.decompress(a85decode(stream)) for stream in streams]
     return "\n".join(s.decode("cp1252") for page in drawn for s in re.findall(rb"\((.*?)\) Tj", page))
 
