@@ -11,6 +11,8 @@ from fab4d.mesh.tetmesh import FloatArray, IntArray
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 SHORTEST = 0.15
 """Shortest distance worth a caliper, as a part of the diagonal."""
+NEWS = 0.02
+"""How much the three distances of a pair must differ from those of the pairs before it, as a part of the diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +46,10 @@ def caliper_checks(
     i, j = np.triu_indices(len(candidates), 1)
     pairs = np.column_stack([candidates[i], candidates[j]])
     d = [_distances(shape, pairs) for shape in (X, x, y)]
-    usable = np.min(d, axis=0) > SHORTEST * bounding_box_diagonal(X)
+    L0 = bounding_box_diagonal(X)
+    usable = np.min(d, axis=0) > SHORTEST * L0
     score = np.where(usable, np.abs(d[2] - d[0]) + np.abs(d[2] - d[1]), -1.0)
-    chosen = _spread(pairs, score, n_pairs)
+    chosen = _spread(pairs, np.column_stack(d), score, n_pairs, NEWS * L0)
     return CaliperChecks(pairs[chosen], X[pairs[chosen]], d[0][chosen], d[1][chosen], d[2][chosen])
 
 
@@ -60,11 +63,18 @@ def _distances(shape: FloatArray, pairs: IntArray) -> FloatArray:
     return np.linalg.norm(shape[pairs[:, 0]] - shape[pairs[:, 1]], axis=1)
 
 
-def _spread(pairs: IntArray, score: FloatArray, n_pairs: int) -> IntArray:
-    """The best scores, taken in turn, that use no vertex more than twice."""
+def _spread(pairs: IntArray, d: FloatArray, score: FloatArray, n_pairs: int, news: float) -> IntArray:
+    """The best scores, taken in turn, that use no vertex more than twice: first those whose distances d (p, 3) tell
+    something new, so that a symmetric part is not measured twice in the same way, then any."""
     chosen: list[int] = []
-    for k in np.argsort(-score, kind="stable"):
-        used = pairs[chosen].ravel()
-        if score[k] >= 0.0 and len(chosen) < n_pairs and max(np.sum(used == v) for v in pairs[k]) < 2:
-            chosen.append(int(k))
+    usable = np.argsort(-score, kind="stable")[: np.sum(score >= 0.0)]
+    for least in (news, 0.0):
+        for k in usable:
+            is_new = not chosen or np.abs(d[chosen] - d[k]).max(axis=1).min() >= least
+            if is_new and k not in chosen and len(chosen) < n_pairs and not _worn(pairs[chosen], pairs[k]):
+                chosen.append(int(k))
     return np.array(chosen, np.int64)
+
+
+def _worn(used: IntArray, pair: IntArray) -> bool:
+    return max(int(np.sum(used == v)) for v in pair) >= 2
