@@ -134,7 +134,8 @@ def _run(job: "Job", selection: "Selection", quiet: bool) -> None:
     lines = report_lines(report) if report else unfinished_lines(job, selection.last)
     click.echo("\n".join([*lines, *file_lines(job.workspace)]))
     if report and report["verdict"] == REJECTED:
-        msg = f"design rejected: {'; '.join(report['reasons'])}"
+        first, *others = report["reasons"]
+        msg = f"design rejected: {first}{f' (and {len(others)} more)' if others else ''}"
         raise DesignRejectedError(msg)
 
 

@@ -180,7 +180,7 @@ def test_a_rejected_design_is_delivered_with_its_reasons_first(scene: Path, stag
     result = fab4d("run", scene)
     assert result.exit_code == errors.DesignRejectedError.exit_code
     assert result.stdout.splitlines()[:3] == ["REJECTED", "  - error 4 mm above 1 mm", "  - grey"]
-    assert "fab4d: design rejected: error 4 mm above 1 mm; grey" in result.stderr
+    assert "fab4d: design rejected: error 4 mm above 1 mm (and 1 more)" in result.stderr
     assert Path("runs/two-tets/print/smp.stl").is_file()
     assert fab4d("run", scene).exit_code == errors.DesignRejectedError.exit_code  # also when nothing has to run
 
