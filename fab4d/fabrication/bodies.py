@@ -65,10 +65,10 @@ def bodies_from_labels(X: FloatArray, tets: IntArray, smp: BoolArray) -> Bodies:
     Raises BodyError when the part is in pieces, touches itself along an edge, or has a tet too flat to print.
     """
     _require_one_piece(X, tets)
+    _require_no_double_edge(X, face_table(tets).boundary)
     vertices = split_fans(tets)
     faces = face_table(vertices)
     points = _fan_points(X, tets, vertices)
-    _require_no_double_edge(points, faces.boundary)
     boundary, points = _surface_fans(points, faces.boundary)
     points = snapped(points)
     _require_positive(points, vertices, tets)

@@ -1,0 +1,167 @@
+"""After the repair every body is a 2-manifold, whatever the labels were."""
+
+from collections import Counter, defaultdict
+from time import perf_counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
+from fab4d.mesh.measures import tet_volumes
+from fab4d.mesh.topology import TET_FACES
+
+
+def pinched_by_hand(tets, smp):
+    """The same question asked of the triangles one by one, in Python sets."""
+    pinched = set()
+    for label in (True, False):
+        faces = Counter(tuple(sorted(face)) for tet in tets[smp == label] for face in tet[TET_FACES].tolist())
+        links = defaultdict(list)
+        for face in (f for f, count in faces.items() if count == 1):
+            for v in face:
+                links[v].append([w for w in face if w != v])
+        pinched |= {v for v, edges in links.items() if not is_one_cycle(edges)}
+    return sorted(pinched)
+
+
+def is_one_cycle(edges):
+    neighbours = defaultdict(set)
+    for a, b in edges:
+        neighbours[a].add(b)
+        neighbours[b].add(a)
+    if any(len(n) != 2 for n in neighbours.values()):
+        return False
+    seen, waiting = set(), [edges[0][0]]
+    while waiting:
+        node = waiting.pop()
+        if node not in seen:
+            seen.add(node)
+            waiting += neighbours[node]
+    return len(seen) == len(neighbours)
+
+
+def repaired(X, tets, smp):
+    return well_composed(tets, smp, tet_volumes(X, tets))
+
+
+def changed_fraction(X, tets, before, after):
+    volumes = tet_volumes(X, tets)
+    return volumes[before != after].sum() / volumes.sum()
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), share=st.floats(0.02, 0.98), n_points=st.integers(0, 60))
+def test_repairs_irregular_meshes(meshes, seed, share, n_points):
+    X, tets = meshes["irregular"](n_points, seed)
+    smp = np.random.default_rng(seed).random(len(tets)) < share
+    assert pinched_by_hand(tets, smp) == pinched_vertices(tets, smp).tolist()
+    assert pinched_by_hand(tets, repaired(X, tets, smp)) == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), shape=st.tuples(*[st.integers(1, 5)] * 3), share=st.floats(0.02, 0.98))
+def test_repairs_boxes(meshes, seed, shape, share):
+    X, tets = meshes["box"](shape)
+    smp = np.random.default_rng(seed).random(len(tets)) < share
+    assert pinched_by_hand(tets, repaired(X, tets, smp)) == []
+
+
+def test_well_composed_labels_stay(meshes):
+    X, tets = meshes["box"]((8, 7, 6))
+    for smp in (X[tets].mean(axis=1)[:, 0] < 4, np.zeros(len(tets), bool), np.ones(len(tets), bool)):
+        assert pinched_by_hand(tets, smp) == []
+        assert np.array_equal(repaired(X, tets, smp), smp)
+
+
+@pytest.mark.parametrize(("noise", "most_changed"), [(0.0, 0.01), (0.02, 0.03), (0.06, 0.07)])
+def test_noise_costs_little_more_than_itself(meshes, noise, most_changed):
+    X, tets = meshes["box"]((12, 10, 10))
+    smp = meshes["blob"](X, tets) ^ (np.random.default_rng(1).random(len(tets)) < noise)
+    result = repaired(X, tets, smp)
+    assert len(pinched_vertices(tets, result)) == 0
+    assert changed_fraction(X, tets, smp, result) < most_changed
+
+
+def test_two_cells_at_an_edge_are_joined_or_parted(meshes):
+    X, tets = meshes["box"]((2, 2, 1))
+    centres = X[tets].mean(axis=1)
+    smp = (centres[:, 0] < 1) == (centres[:, 1] < 1)
+    edge = np.flatnonzero(np.all(X[:, :2] == 1, axis=1))
+    assert pinched_vertices(tets, smp).tolist() == edge.tolist()
+    assert len(pinched_vertices(tets, repaired(X, tets, smp))) == 0
+
+
+def test_costly_tets_are_kept(meshes):
+    X, tets = meshes["box"]((8, 8, 8))
+    smp = np.random.default_rng(2).random(len(tets)) < 0.5
+    dear = X[tets].mean(axis=1)[:, 2] < 4
+    plain = well_composed(tets, smp, np.ones(len(tets)))
+    careful = well_composed(tets, smp, np.where(dear, 100.0, 1.0))
+    assert np.sum(dear & (careful != smp)) < np.sum(dear & (plain != smp))
+
+
+def test_equal_input_gives_equal_labels(meshes):
+    X, tets = meshes["box"]((6, 6, 6))
+    smp = np.random.default_rng(4).random(len(tets)) < 0.5
+    assert np.array_equal(repaired(X, tets, smp), repaired(X, tets, smp))
+
+
+def test_input_is_left_alone(meshes):
+    X, tets = meshes["box"]((4, 4, 4))
+    smp = np.random.default_rng(5).random(len(tets)) < 0.5
+    before = smp.copy()
+    repaired(X, tets, smp)
+    assert np.array_equal(before, smp)
+
+
+def test_one_label_flips_end_the_search_alone(meshes):
+    """What the free search may leave is always removed by flips of one label."""
+    from fab4d.fabrication import wellcomposed as w
+
+    _, tets = meshes["box"]((6, 6, 5))
+    links = w.links_of(w.split_fans(tets))
+    smp = np.random.default_rng(6).random(len(tets)) < 0.5
+    nowhere = np.zeros(len(links.n_nodes), bool)
+    state = w._state(smp, smp, np.ones(len(tets)), nowhere, w.FREE, links, w._scratch(links))
+    result = w._one_way(state, links, w._scratch(links))
+    assert len(pinched_vertices(tets, result)) == 0
+    assert np.all(result >= smp) or np.all(result <= smp)
+
+
+@pytest.mark.slow
+def test_hundred_thousand_tossed_coins_take_ten_seconds(meshes):
+    X, tets = meshes["box"]((26, 26, 25))
+    smp = np.random.default_rng(0).random(len(tets)) < 0.5
+    repaired(*meshes["box"]((2, 2, 2)), np.arange(48) % 2 == 0)
+    start = perf_counter()
+    result = repaired(X, tets, smp)
+    assert perf_counter() - start < 10
+    assert len(pinched_vertices(tets, result)) == 0
+
+
+class TestPartThatTouchesItself:
+    """Labels cannot help where the part itself is pinched."""
+
+    def test_two_cubes_at_a_vertex_are_repaired_each_for_itself(self, meshes):
+        X, tets = meshes["ring"]()
+        smp = np.random.default_rng(7).random(len(tets)) < 0.5
+        part = pinched_vertices(tets)
+        assert len(part) == 1
+        assert np.setdiff1d(pinched_vertices(tets, repaired(X, tets, smp)), part).size == 0
+
+    def test_around_two_meeting_hollows_there_is_one_material(self, meshes):
+        X, tets = meshes["hollows"]()
+        part = pinched_vertices(tets)
+        assert X[part].tolist() == [[2.0, 2.0, 2.0]]
+        result = repaired(X, tets, np.random.default_rng(8).random(len(tets)) < 0.5)
+        assert len(np.unique(result[(tets == part[0]).any(axis=1)])) == 1
+        assert np.setdiff1d(pinched_vertices(tets, result), part).size == 0
+
+    def test_a_double_edge_does_not_keep_the_search_going(self, meshes):
+        X, tets = meshes["cells"]([(0, 0, 0), (1, 1, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)])
+        part = pinched_vertices(tets)
+        assert len(part) >= 2
+        result = repaired(X, tets, np.random.default_rng(9).random(len(tets)) < 0.5)
+        assert np.setdiff1d(pinched_vertices(tets, result), part).size == 0
