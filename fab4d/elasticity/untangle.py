@@ -59,7 +59,7 @@ def untangle(X: FloatArray, x: FloatArray, tets: IntArray) -> Untangled:
             best = max(best, _relax(target, region), key=lambda y: float(_dets(y, tets, inverse).min()))
     distance = L0 * np.linalg.norm(best - target, axis=1)
     return Untangled(
-        L0 * best,
+        np.where(distance[:, None] > 0, L0 * best, x),
         float(_dets(best, tets, inverse).min()),
         float(distance[np.unique(boundary)].max()),
         int(np.count_nonzero(distance)),

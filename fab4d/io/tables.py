@@ -64,8 +64,9 @@ def parsed(value: Any, parse: Parser, where: str) -> Any:
 
 def nearest(name: str, known: list[str]) -> str:
     """How a message goes on after an unknown name: the nearest known one, or all of them."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f'did you mean "{close[0]}"?' if close else f"known: {', '.join(known)}"
+    by_lower_case = {word.lower(): word for word in known}
+    close = difflib.get_close_matches(name.lower(), by_lower_case, n=1, cutoff=0.5)
+    return f'did you mean "{by_lower_case[close[0]]}"?' if close else f"known: {', '.join(known)}"
 
 
 def _unknown_key(name: str, known: list[str], where: str) -> str:

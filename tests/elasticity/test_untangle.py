@@ -54,4 +54,4 @@ def test_an_inverted_surface_moves_just_as_far_as_told() -> None:
     mended = untangle(CENTRE, x, TETS)
     assert mended.min_det_F > 0
     assert mended.surface_moved == pytest.approx(np.linalg.norm(mended.x - x, axis=1)[:4].max())
-    assert 0.1 < mended.surface_moved
+    assert mended.surface_moved > 0.1

@@ -1,0 +1,491 @@
+"""Every refusal, repair and warning of the mesh doctor, on meshes made hostile on purpose."""
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fab4d.errors import MeshError, SceneError
+from fab4d.io.cards import load_material, load_printer
+from fab4d.io.meshes import RawMesh, read_mesh
+from fab4d.io.scene import ClampRegion, load_scene
+from fab4d.mesh.measures import deformation_gradients, tet_volumes
+from fab4d.mesh.topology import face_table
+from fab4d.stages.check import run
+from fab4d.stages.monitor import SilentMonitor
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+# Six tets around the diagonal of a cell, all positive.
+CORNERS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+LEFT = (ClampRegion(box=((-1, -1, -1), (0.5, 99, 99))),)
+Arrays = dict[str, np.ndarray]
+
+
+def grid(*cells: int, size: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
+    """A box of cubes with 6 tets each, mm."""
+    shape = np.array(cells) + 1
+    numbers = np.arange(shape.prod()).reshape(*shape)
+    corner = [
+        numbers[i : i + cells[0], j : j + cells[1], k : k + cells[2]].ravel()
+        for k in (0, 1)
+        for j in (0, 1)
+        for i in (0, 1)
+    ]
+    points = size * np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    return points.astype(float), np.stack(corner, axis=1)[:, CORNERS].reshape(-1, 4)
+
+
+def bent(points: np.ndarray) -> np.ndarray:
+    """The points bent by half a radian per 30 mm about the y axis."""
+    angle, radius = points[:, 0] / 60, 60 + points[:, 2]
+    return np.column_stack([radius * np.sin(angle), points[:, 1], radius * np.cos(angle) - 60])
+
+
+X, TETS = grid(6, 2, 2)
+Y = bent(X)
+
+
+def raw(points: np.ndarray, tets: np.ndarray = TETS, file: str = "perm.vtu", **sets: np.ndarray) -> RawMesh:
+    return RawMesh(points, tets, sets, file)
+
+
+def check(
+    permanent: RawMesh,
+    temporary: RawMesh,
+    clamp: tuple[ClampRegion, ...] = LEFT,
+    units: str = "mm",
+    material: str = "paper-corrected",
+) -> tuple[Arrays, dict[str, Any]]:
+    profile = {
+        "units": units,
+        "clamp": clamp,
+        "printer": load_printer("generic-dual-0.4", Path()),
+        "materials": load_material(material, Path()),
+        "gravity": None,
+    }
+    result = run({"permanent": permanent, "temporary": temporary}, profile, SilentMonitor())
+    return result["mesh"], result["check_report"]
+
+
+def check_points(x: np.ndarray, y: np.ndarray, tets: np.ndarray = TETS, **more: Any) -> tuple[Arrays, dict[str, Any]]:
+    return check(raw(x, tets), raw(y, tets, "temp.vtu"), **more)
+
+
+def codes(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {finding["code"]: finding for finding in report["findings"]}
+
+
+def test_a_sound_pair_passes_without_findings() -> None:
+    mesh, report = check_points(X, Y)
+    assert report["findings"] == []
+    assert not report["nothing_to_program"]
+    np.testing.assert_array_equal(mesh["X"], X)
+    np.testing.assert_array_equal(mesh["X_temp"], Y)
+    np.testing.assert_array_equal(np.flatnonzero(mesh["clamp"]), np.flatnonzero(X[:, 0] == 0))
+    np.testing.assert_array_equal(mesh["vertex_map"], np.arange(len(X)))
+    assert report["statistics"]["interior_vertices"] == 5
+    assert report["statistics"]["volume_mm3"] == pytest.approx(30 * 10 * 10)
+
+
+@pytest.mark.parametrize(("units", "mm"), [("m", 1000.0), ("cm", 10.0), ("in", 25.4)])
+def test_any_unit_gives_the_same_mesh(units: str, mm: float) -> None:
+    expected, _ = check_points(X, Y)
+    mesh, _ = check_points(X / mm, Y / mm, units=units)
+    for name in ("X", "X_temp"):
+        np.testing.assert_allclose(mesh[name], expected[name], rtol=1e-12, atol=1e-12 * 30)
+    for name in ("tets", "clamp", "vertex_map", "tet_map"):
+        np.testing.assert_array_equal(mesh[name], expected[name])
+
+
+# 1. Each file.
+
+
+def test_vertex_numbers_out_of_range_are_refused() -> None:
+    tets = TETS.copy()
+    tets[17, 2] = 9999
+    with pytest.raises(MeshError, match=r"temp\.vtu: tet 17 use.* outside 0\.\.62"):
+        check(raw(X), raw(Y, tets, "temp.vtu"))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_refused(value: float) -> None:
+    x = X.copy()
+    x[7, 1] = value
+    with pytest.raises(MeshError, match=r"perm\.vtu: vertex 7 .* not finite"):
+        check_points(x, Y)
+
+
+# 2. Units.
+
+
+def test_metres_called_millimetres_are_refused_with_the_likely_unit() -> None:
+    with pytest.raises(MeshError, match=r"longest side is 0\.03 mm .*likely m\)"):
+        check_points(X / 1000, Y / 1000)
+
+
+def test_millimetres_called_metres_are_refused_with_the_likely_unit() -> None:
+    with pytest.raises(MeshError, match=r"longest side is 3e\+04 mm .*likely mm or cm\)"):
+        check_points(X, Y, units="m")
+
+
+def test_two_files_in_different_units_are_refused() -> None:
+    with pytest.raises(MeshError, match=r"temp\.vtu: its diagonal is 0\.001\d* times .*units"):
+        check_points(X, Y / 1000)
+
+
+def test_a_part_larger_than_the_printer_is_refused() -> None:
+    with pytest.raises(MeshError, match=r"450 x 150 x 150 mm do not fit into the 300 x 300 x 300 mm .*generic-dual"):
+        check_points(15 * X, 15 * Y)
+
+
+# 3. Compatibility.
+
+
+def test_other_vertex_counts_are_refused() -> None:
+    with pytest.raises(MeshError, match=r"temp\.vtu: 64 vertices, but perm\.vtu has 63"):
+        check(raw(X), raw(np.vstack([Y, Y[:1]]), file="temp.vtu"))
+
+
+def test_other_connectivity_is_refused_with_the_tet() -> None:
+    # The cells cut along another diagonal, but for one tet: the numbers of tets at the vertices differ.
+    swapped = np.arange(len(X)).reshape(7, 3, 3)[:, ::-1].ravel()
+    other = np.vstack([swapped[TETS[:, [0, 1, 3, 2]]][:-1], TETS[-1:]])
+    with pytest.raises(MeshError, match=r"144 and 144 tets, of which \d+ .*tet \d+ of perm\.vtu with vertices \["):
+        check(raw(X), raw(Y, other, "temp.vtu"))
+    with pytest.raises(MeshError, match=r"tet 5 of perm\.vtu .* is not in temp\.vtu"):
+        check(raw(X), raw(Y, np.delete(TETS, 5, axis=0), "temp.vtu"))
+
+
+def test_renumbered_vertices_are_recognised() -> None:
+    number = np.random.default_rng(0).permutation(len(X))
+    y = np.zeros_like(Y)
+    y[number] = Y
+    with pytest.raises(MeshError, match=r"temp\.vtu: .*renumbered by the exporter"):
+        check(raw(X), raw(y, number[TETS], "temp.vtu"))
+
+
+def test_an_odd_permutation_is_refused_and_named() -> None:
+    tets = TETS.copy()
+    tets[9] = tets[9, [1, 0, 2, 3]]
+    with pytest.raises(MeshError, match=r"temp\.vtu: 1 tets .*tet 9.*odd permutation"):
+        check(raw(X), raw(Y, tets, "temp.vtu"))
+
+
+def test_row_order_and_even_permutations_do_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    tets = rng.permutation(TETS)
+    tets[::2] = tets[::2][:, [1, 2, 0, 3]]
+    mesh, report = check(raw(X), raw(Y, tets, "temp.vtu"))
+    assert report["findings"] == []
+    np.testing.assert_array_equal(mesh["tets"], TETS)
+
+
+# 4. Cleaning.
+
+
+def test_unused_vertices_are_left_out_of_everything() -> None:
+    far = np.array([[1e7, 0, 0], [np.nan, 0, 0]])
+    stray = np.vstack([far, X]), np.vstack([far, Y])
+    mesh, report = check_points(*stray, tets=TETS + 2)
+    assert codes(report)["unreferenced-vertex"]["indices"] == [0, 1]
+    assert codes(report)["unreferenced-vertex"]["severity"] == "repaired"
+    np.testing.assert_array_equal(mesh["vertex_map"], np.arange(2, len(X) + 2))
+    np.testing.assert_array_equal(mesh["X"], X)
+    np.testing.assert_array_equal(mesh["tets"], TETS)
+
+
+def test_duplicate_tets_and_repeated_vertices_are_left_out() -> None:
+    tets = np.vstack([TETS[:3], [[4, 4, 5, 6]], TETS[3:], TETS[8:9][:, [2, 0, 1, 3]]])
+    mesh, report = check_points(X, Y, tets)
+    assert codes(report)["repeated-vertex"]["indices"] == [3]
+    assert codes(report)["duplicate-tet"]["indices"] == [len(tets) - 1]
+    np.testing.assert_array_equal(mesh["tets"], TETS)
+    np.testing.assert_array_equal(tets[mesh["tet_map"]], TETS)
+
+
+def test_tets_of_repeated_vertices_alone_are_refused() -> None:
+    with pytest.raises(MeshError, match="no tet has four different vertices"):
+        check_points(X, Y, np.array([[0, 0, 9, 1]]))
+
+
+def with_mid_nodes(points: np.ndarray, sag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    from fab4d.mesh.quadratic import quadratic_tets, with_midpoints
+
+    tets, edges = quadratic_tets(TETS, len(X))
+    nodes = with_midpoints(points, edges)
+    nodes[len(X)] += sag
+    return nodes, tets
+
+
+def test_ten_node_tets_give_their_corners_and_curved_sides_are_told() -> None:
+    (x, tets), (y, _) = with_mid_nodes(X), with_mid_nodes(Y)
+    mesh, report = check_points(x, y, tets)
+    assert report["findings"] == []
+    np.testing.assert_array_equal(mesh["tets"], TETS)
+    _, report = check_points(x, with_mid_nodes(Y, 0.3)[0], tets)
+    curved = codes(report)["curved-sides"]
+    assert curved["severity"] == "warning"
+    assert curved["file"] == "temp.vtu"
+    assert "0.52 mm" in curved["message"]
+
+
+# 5. Orientation.
+
+
+def test_left_handed_tets_are_turned_round() -> None:
+    tets = TETS.copy()
+    tets[[4, 40]] = tets[[4, 40]][:, [0, 2, 1, 3]]
+    mesh, report = check_points(X, Y, tets)
+    assert codes(report)["left-handed"]["indices"] == [4, 40]
+    assert tet_volumes(mesh["X"], mesh["tets"]).min() > 0
+    mesh, report = check_points(X, Y, TETS[:, [0, 2, 1, 3]])
+    assert codes(report)["left-handed"]["count"] == len(TETS)
+    assert tet_volumes(mesh["X"], mesh["tets"]).min() > 0
+
+
+@pytest.mark.parametrize("exporter_turned_them", [False, True])
+def test_a_folded_permanent_shape_is_refused(exporter_turned_them: bool) -> None:
+    inner = int(np.flatnonzero(np.all(X == [15, 5, 5], axis=1))[0])
+    x = X.copy()
+    x[inner] += [12, 0, 0]
+    negative = tet_volumes(x, TETS) < 0
+    assert negative.any()
+    tets = np.where((negative & exporter_turned_them)[:, None], TETS[:, [0, 1, 3, 2]], TETS)
+    with pytest.raises(MeshError, match=r"perm\.vtu: tets \d+, .* folded .*volume"):
+        check_points(x, Y, tets)
+
+
+def test_a_face_of_three_tets_is_refused() -> None:
+    x = np.vstack([X, [[15, 5, 40]]])
+    inside = face_table(TETS)
+    tets = np.vstack([TETS, [[*inside.interior[40], len(X)]]])
+    first, second = inside.interior_tets[40]
+    with pytest.raises(MeshError, match=rf"more than two tets share a face \(tets {first}, {second}, 144\)"):
+        check_points(x, bent(x), tets)
+
+
+# 6. Tets.
+
+
+def test_zero_volume_is_refused() -> None:
+    x = X.copy()
+    x[X[:, 2] == 0, 2] = 5
+    with pytest.raises(MeshError, match=r"perm\.vtu: 72 tets have no volume .*tet 0 with vertices"):
+        check_points(x, Y)
+
+
+def flattened(height: float) -> np.ndarray:
+    x = X.copy()
+    x[X[:, 2] == 0, 2] = 5 - height
+    return x
+
+
+def test_flat_tets_are_refused_and_thin_ones_told() -> None:
+    with pytest.raises(MeshError, match=r"tets are flat .*dihedral angle 0\.0\d+ degrees"):
+        check_points(flattened(0.003), bent(flattened(0.003)))
+    _, report = check_points(flattened(0.3), bent(flattened(0.3)))
+    assert codes(report)["thin-tet"]["severity"] == "warning"
+    assert codes(report)["thin-tet"]["count"] > 10
+
+
+# 7. Deformation.
+
+
+@pytest.mark.parametrize("mirror", [[-1, 1, 1], [1, 1, -1]])
+def test_a_mirror_image_is_recognised(mirror: list[int]) -> None:
+    with pytest.raises(MeshError, match=r"temp\.vtu: the mirror image of perm\.vtu"):
+        check_points(X, Y * mirror)
+
+
+def test_an_inverted_inside_is_mended_without_moving_the_surface() -> None:
+    inner = np.flatnonzero(np.all((X[:, 1:] == 5), axis=1) & (X[:, 0] == 15))
+    y = Y.copy()
+    y[inner] += [12, 0, 0]
+    assert np.linalg.det(deformation_gradients(X, y, TETS)).min() < 0
+    mesh, report = check_points(X, y)
+    assert np.linalg.det(deformation_gradients(mesh["X"], mesh["X_temp"], mesh["tets"])).min() > 0.1
+    assert codes(report)["inverted"]["severity"] == "repaired"
+    surface = np.unique(face_table(TETS).boundary)
+    np.testing.assert_array_equal(mesh["X_temp"][surface], y[surface])
+
+
+def test_a_surface_vertex_pushed_in_is_mended_and_told() -> None:
+    corner = int(np.flatnonzero(np.all(X == [15, 5, 10], axis=1))[0])
+    y = Y.copy()
+    y[corner, 2] -= 10.3
+    mesh, report = check_points(X, y)
+    assert np.linalg.det(deformation_gradients(mesh["X"], mesh["X_temp"], mesh["tets"])).min() > 0
+    told = re.search(r"those of the surface up to (\S+) mm", codes(report)["inverted"]["message"])
+    assert told
+    moved = np.linalg.norm(mesh["X_temp"] - y, axis=1)[np.unique(face_table(TETS).boundary)].max()
+    assert 0.2 < float(told[1]) == pytest.approx(moved, rel=1e-2)
+
+
+def test_what_cannot_be_mended_is_refused_with_the_tets() -> None:
+    y = Y[np.random.default_rng(3).permutation(len(Y))]
+    with pytest.raises(MeshError, match=r"temp\.vtu: \d+ tets are inverted \(tets .*cannot mend"):
+        check_points(X, y)
+
+
+def test_strong_deformation_is_told() -> None:
+    _, report = check_points(X, Y * [4, 1, 1])
+    assert {"stretch-smp", "stretch-tpe"} <= codes(report).keys()
+    _, report = check_points(X, X * [1, 1, 0.05])
+    assert codes(report)["squeezed"]["count"] == len(TETS)
+
+
+def test_a_doubtful_material_is_told() -> None:
+    _, report = check_points(X, Y, material="paper-printed")
+    assert "Poisson ratio of glassy is -0.03" in codes(report)["material"]["message"]
+
+
+# 8. Rigid motion.
+
+
+@pytest.mark.parametrize("offset", [0.0, 4e6])
+def test_a_rigid_motion_is_nothing_to_program(offset: float) -> None:
+    c, s = np.cos(1), np.sin(1)
+    moved = X @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [3, 2, 1] + offset
+    _, report = check_points(X, moved)
+    assert report["nothing_to_program"]
+    assert report["statistics"]["target_max_mm"] < 1e-6
+    assert any("rig sheet" in entry["what"] for entry in report["left_out"])
+
+
+def test_geo_referenced_coordinates_work() -> None:
+    x = X + np.array([4e6, 5e5, 100.0])
+    mesh, report = check_points(x, Y, clamp=(ClampRegion(vertices=tuple(range(9))),))
+    assert report["findings"] == []
+    np.testing.assert_array_equal(mesh["X"], x)
+
+
+def test_a_clamp_that_would_have_to_deform_is_told() -> None:
+    _, report = check_points(X, X * [1, 1.5, 1])
+    assert codes(report)["clamp-deforms"]["severity"] == "warning"
+
+
+# 9. Boundary, components, clamp.
+
+
+def two_pieces(gap: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    points = np.vstack([X, X + np.array([30 + gap, 0, 0])])
+    return points, np.vstack([TETS, TETS + len(X)])
+
+
+def test_each_piece_needs_a_clamp() -> None:
+    x, tets = two_pieces()
+    with pytest.raises(MeshError, match=rf"one of 2 separate pieces, that of vertex {len(X)}, has no clamp"):
+        check_points(x, bent(x), tets)
+    both = (*LEFT, ClampRegion(box=((61, -1, -1), (63, 99, 99))))
+    _, report = check_points(x, bent(x), tets, clamp=both)
+    assert report["statistics"]["components"] == 2
+
+
+def test_pieces_without_any_clamp_are_refused_each() -> None:
+    x, tets = two_pieces()
+    with pytest.raises(MeshError) as caught:
+        check_points(x, bent(x), tets, clamp=())
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_one_piece_needs_no_clamp() -> None:
+    mesh, report = check_points(X, Y, clamp=())
+    assert not mesh["clamp"].any()
+    assert "clamp" in {entry["what"] for entry in report["left_out"]}
+
+
+def test_unmerged_vertices_are_told() -> None:
+    x, tets = two_pieces(gap=0.0)
+    both = (*LEFT, ClampRegion(box=((59, -1, -1), (61, 99, 99))))
+    _, report = check_points(x, bent(x), tets, clamp=both)
+    assert codes(report)["coincident-vertices"]["count"] == 9
+
+
+def test_a_surface_that_touches_itself_is_refused_along_edges_and_told_at_vertices() -> None:
+    x, tets = grid(2, 2, 1)
+    cell = np.arange(len(tets)) // 6
+    along_edge = tets[np.isin(cell, [0, 3])]
+    with pytest.raises(MeshError, match=r"touches itself along 1 edges \(vertices \d+ and \d+\)"):
+        check_points(x, bent(x), along_edge, clamp=())
+    x, tets = grid(2, 2, 2)
+    at_vertex = tets[np.isin(np.arange(len(tets)) // 6, [0, 7])]
+    _, report = check_points(x, bent(x), at_vertex, clamp=())
+    assert codes(report)["non-manifold-vertex"]["indices"] == [13]
+
+
+def test_a_part_one_tet_thick_is_told() -> None:
+    x, tets = grid(6, 2, 1)
+    _, report = check_points(x, bent(x), tets)
+    assert codes(report).keys() == {"one-tet-thick"}
+
+
+@pytest.mark.parametrize(
+    ("region", "message"),
+    [
+        (ClampRegion(box=((40, 0, 0), (50, 1, 1))), r"1 catches no vertex .* box is \[40, 50\] .* part's \[0, 30\]"),
+        (ClampRegion(box=((-1, -1, -1), (99, 99, 99))), "holds all 63 vertices"),
+        (ClampRegion(vertices=(0, 63)), r"vertex 63 is not in perm\.vtu, whose vertices are 0\.\.62"),
+        (ClampRegion(set_name="foot"), r'no vertex set "foot"; it has: base, none'),
+        (ClampRegion(set_name="none"), "catches no vertex"),
+    ],
+)
+def test_a_clamp_that_catches_nothing_or_everything_is_refused(region: ClampRegion, message: str) -> None:
+    permanent = raw(X, base=np.arange(9), none=np.arange(0))
+    with pytest.raises(SceneError, match=message):
+        check(permanent, raw(Y, file="temp.vtu"), clamp=(region,))
+
+
+def test_clamps_by_number_and_by_set_hold_the_vertices_of_the_file() -> None:
+    x, y = np.vstack([X[:1] + 99, X]), np.vstack([Y[:1], Y])
+    permanent = raw(x, TETS + 1, base=np.arange(4, 7))
+    mesh, _ = check(
+        permanent, raw(y, TETS + 1, "temp.vtu"), (ClampRegion(vertices=(1, 2)), ClampRegion(set_name="base"))
+    )
+    np.testing.assert_array_equal(mesh["vertex_map"][mesh["clamp"]], [1, 2, 4, 5, 6])
+
+
+def test_a_clamp_on_one_line_is_refused() -> None:
+    with pytest.raises(MeshError, match=r"only vertices 0, 1, 2 of a piece, on one line"):
+        check_points(X, Y, clamp=(ClampRegion(vertices=(0, 1, 2)),))
+
+
+# Real meshes, and many tets.
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the shared cases are not beside this checkout")
+@pytest.mark.parametrize("case", ["dino_bend50k", "eiffel_bend", "human_pose", "lattice_twist", "spot_bend190k"])
+def test_the_shared_cases_import(case: str) -> None:
+    scene = load_scene(CASES / case)
+    mesh, report = check(read_mesh(scene.permanent), read_mesh(scene.temporary), scene.clamp, scene.units)
+    assert {finding["severity"] for finding in report["findings"]} <= {"warning"}
+    assert report["statistics"]["min_det_F"] > 0.4
+    assert report["statistics"]["clamp_deformation_mm"] < 1e-9
+    assert 0 < mesh["clamp"].sum() < len(mesh["X"])
+    assert mesh["X"].max() > 10
+
+
+def test_many_tets_are_checked_in_seconds() -> None:
+    from time import process_time
+
+    x, tets = grid(46, 26, 26, size=1.0)
+    assert len(tets) > 186_000
+    start = process_time()
+    _, report = check_points(x, bent(x), tets)
+    assert process_time() - start < 20
+    assert report["findings"] == []
+
+
+def test_the_order_of_checks_starts_with_the_files() -> None:
+    """Of several faults the first check's is told: a user mends units before shapes."""
+    faults = [
+        (replace(raw(X), points=np.where(np.arange(63)[:, None] == 5, np.nan, X)), "not finite"),
+        (raw(X / 1e6), "longest side"),
+        (raw(X[:, [1, 0, 2]], np.delete(TETS, 0, axis=0)), "only in"),
+    ]
+    for (mesh, message), _ in pairwise([*faults, faults[0]]):
+        with pytest.raises(MeshError, match=message):
+            check(mesh, raw(Y, TETS[:, [1, 0, 2, 3]], "temp.vtu"))
