@@ -1,0 +1,21 @@
+"""A mesh for stages that need one."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from fab4d.mesh.measures import tet_volumes
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    """A box of 6 x 5 x 4 cells of 5 mm, six tets each."""
+    corners = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
+    kuhn = np.array([[0, 1 << a, (1 << a) + (1 << b), 7] for a, b, _ in permutations(range(3))])
+    places = np.indices((6, 5, 4)).reshape(3, -1).T[:, None] + corners
+    X, number = np.unique(places.reshape(-1, 3), axis=0, return_inverse=True)
+    tets = number.reshape(-1, 8)[:, kuhn].reshape(-1, 4)
+    negative = tet_volumes(5.0 * X, tets) < 0
+    tets[negative] = tets[negative][:, [0, 1, 3, 2]]
+    return {"X": 5.0 * X, "tets": tets}
