@@ -186,35 +186,53 @@ class Equilibria:
         return Median(x, solution.z[n:].reshape(-1, 3), solution, gradients)
 
     # -- final -------------------------------------------------------------------------------------------------------
-    def _final_terms(self, rho: FloatArray, median: Median, y: FloatArray) -> list[tuple]:
-        """Kernel arguments of the glassy and the TPE term; zero moduli mark elements without that material."""
+    def _final_terms(self, rho: FloatArray, median: Median, y: FloatArray, unloaded: float = 1.0) -> list[tuple]:
+        """Kernel arguments of the glassy and the TPE term; zero moduli mark elements without that material.
+
+        unloaded : share of the TPE that pulls back; the rest is taken as stress-free in the median shape
+        """
         body, glassy, tpe = self.problem.body, self.problem.glassy, self.problem.tpe
+        pull, still = unloaded * (1 - rho), (1 - unloaded) * (1 - rho)
+        from_median = rho * glassy.mu + still * tpe.mu, rho * glassy.kappa + still * tpe.kappa
         return [
-            (body.elements, median.gradients, body.weights, rho * glassy.mu, rho * glassy.kappa, y - median.x),
-            (body.elements, body.dN, body.weights, (1 - rho) * tpe.mu, (1 - rho) * tpe.kappa, y - body.X),
+            (body.elements, median.gradients, body.weights, *from_median, y - median.x),
+            (body.elements, body.dN, body.weights, pull * tpe.mu, pull * tpe.kappa, y - body.X),
         ]
 
-    def final_gradient(self, rho: FloatArray, median: Median, y: FloatArray) -> tuple[FloatArray, float]:
+    def final_gradient(
+        self, rho: FloatArray, median: Median, y: FloatArray, unloaded: float = 1.0
+    ) -> tuple[FloatArray, float]:
         """dW_fin/dy (N, 3) and W_fin (inf where an element is inverted)."""
         g, total = np.zeros_like(y), 0.0
-        for term in self._final_terms(rho, median, y):
+        for term in self._final_terms(rho, median, y, unloaded):
             total += kernels.gradient(*term, g)[0]
         return g, total
 
-    def final_tangent(self, rho: FloatArray, median: Median, y: FloatArray, spd: bool = False) -> FloatArray:
+    def final_tangent(
+        self, rho: FloatArray, median: Median, y: FloatArray, spd: bool = False, unloaded: float = 1.0
+    ) -> FloatArray:
         """Values of d2W_fin/dy2 in the free pattern, six dofs decoupled."""
         pattern = self.free_pattern
         data = np.zeros(pattern.nnz)
         assemble = kernels.tangent_spd if spd else kernels.tangent
-        for term in self._final_terms(rho, median, y):
+        for term in self._final_terms(rho, median, y, unloaded):
             assemble(*term, pattern.rank, pattern.indptr, data)
         self.free_mask.apply(data, 1.0)
         return data
 
     def solve_final(
-        self, rho: FloatArray, median: Median, y: FloatArray, tolerance: float = 1e-9, max_iterations: int = 25
+        self,
+        rho: FloatArray,
+        median: Median,
+        y: FloatArray,
+        tolerance: float = 1e-9,
+        max_iterations: int = 25,
+        unloaded: float = 1.0,
     ) -> Final:
-        """Final shape after unloading, from the guess y; the tolerance is relative to the largest nodal TPE force."""
+        """Final shape after unloading, from the guess y; the tolerance is relative to the TPE's pull at the median shape.
+
+        unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape.
+        """
         shape, fixed = y.shape, self.free_mask.fixed
         body, tpe = self.problem.body, self.problem.tpe
         pull = np.zeros_like(y)
@@ -224,16 +242,16 @@ class Equilibria:
         scale = max(float(np.sqrt(pull.ravel() @ pull.ravel())), 1e-6)
 
         def residual(z: FloatArray) -> Residual:
-            g, energy = self.final_gradient(rho, median, z.reshape(shape))
+            g, energy = self.final_gradient(rho, median, z.reshape(shape), unloaded)
             r = g.ravel()
             r[fixed] = 0.0
             return Residual(r, scale, energy)
 
         def factor(z: FloatArray) -> Factor:
-            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape)))
+            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), unloaded=unloaded))
 
         def fallback(z: FloatArray) -> Factor:
-            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), spd=True))
+            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), True, unloaded))
 
         solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0)
         return Final(solution.z.reshape(shape), solution)

@@ -115,9 +115,7 @@ class DampedModel:
         dy, df = m.lin.forward_rho(v)
         dc = -self._held(self._onto_held(*self._pull_back(dy, df)))
         gy, gf = self._pull_back(dy + m.dy_dc @ dc, df + m.df_dc @ dc)
-        return (
-            m.lin.adjoint_rho(gf, gy) + (m.terms.curvature + self.damping) * v + 2 * m.lam_smooth * (m.L @ v)
-        )
+        return m.lin.adjoint_rho(gf, gy) + (m.terms.curvature + self.damping) * v + 2 * m.lam_smooth * (m.L @ v)
 
     def diagonal(self) -> FloatArray:
         """(m,) the part of the Hessian's diagonal that costs nothing: the Jacobi preconditioner."""

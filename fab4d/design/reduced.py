@@ -86,6 +86,17 @@ def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibri
     return equilibria, Design(rho, held_positions(equilibria, median), median, final)
 
 
+def at_rest(problem: Problem) -> Iterate:
+    """The part of TPE alone, with nothing held: it stays in its permanent shape."""
+    equilibria, rho, X = (
+        Equilibria(problem, build_patches(problem, np.zeros(0, np.int64), 0.0)),
+        np.zeros(problem.n_tets),
+        problem.body.X,
+    )
+    median = equilibria.solve_median(rho, np.zeros((0, 3)), X, np.zeros((0, 3)))
+    return Iterate("rest", equilibria, Design(rho, np.zeros((0, 3)), median, equilibria.solve_final(rho, median, X)))
+
+
 def _relaxed(equilibria: Equilibria, rho: FloatArray, x: FloatArray) -> Median:
     """The median shape reached from x with the patches held where x has them."""
     patches = equilibria.patches
@@ -162,7 +173,9 @@ def change_density(equilibria: Equilibria, design: Design, rho: FloatArray) -> D
     return design
 
 
-def refit(equilibria: Equilibria, design: Design, weights: ObjectiveWeights, watch: Watch, iterations: int = 12) -> Design:
+def refit(
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, watch: Watch, iterations: int = 12
+) -> Design:
     """Held positions that are best for the design's fixed density; the density does not move."""
     problem = equilibria.problem
     weights = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
@@ -170,7 +183,7 @@ def refit(equilibria: Equilibria, design: Design, weights: ObjectiveWeights, wat
     fixed = np.zeros(problem.n_tets, bool)
     damping, value = 1e-3, evaluate(equilibria, weights, L, design)
     for _ in range(iterations):
-        step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed)
+        step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed, tries=12)
         if not step.accepted:
             break
         slow = step.value > (1 - 1e-4) * value

@@ -12,9 +12,7 @@ from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.solvers.linear import Factor
 
 
-def _element_forces(
-    equilibria: Equilibria, gradients: FloatArray, moduli: Moduli, u: FloatArray
-) -> FloatArray:
+def _element_forces(equilibria: Equilibria, gradients: FloatArray, moduli: Moduli, u: FloatArray) -> FloatArray:
     body = equilibria.problem.body
     out = np.zeros((*body.elements.shape, 3))
     ones = np.ones(len(body.elements))

@@ -67,7 +67,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """method: `reduced` or `admm`; element: `linear` or `quadratic`; seed of every random choice."""
+    """method: `reduced`; element: `linear` or `quadratic`; seed of every random choice."""
 
     method: str = "reduced"
     element: str = "linear"
@@ -112,7 +112,7 @@ _GOAL = {"tolerance": Key(positive), "max_forces": Key(whole(1)), "max_smp_fract
 _WEIGHTS = {weight.name: Key(non_negative) for weight in fields(Weights)}
 _ACCEPTANCE = {limit.name: Key(fraction) for limit in fields(Acceptance)}
 _SOLVER = {
-    "method": Key(one_of("reduced", "admm")),
+    "method": Key(one_of("reduced")),
     "element": Key(one_of("linear", "quadratic")),
     "seed": Key(whole(0)),
 }

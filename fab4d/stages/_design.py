@@ -1,0 +1,112 @@
+"""What the stages solve, refit and verify share: the dimensionless problem, patch arrays, and the trace of iterates."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.gauss_newton import Design
+from fab4d.design.objective import ObjectiveWeights
+from fab4d.design.patches import Patches, patches_from_faces
+from fab4d.design.problem import Problem, build_problem
+from fab4d.design.reduced import Iterate
+from fab4d.fabrication.labels import ambiguous_fraction
+from fab4d.io.csvtable import csv_bytes
+from fab4d.io.scene import Goal, RigCard, Weights
+from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.distance import shape_error
+from fab4d.mesh.measures import vertex_areas
+from fab4d.stages.monitor import Monitor
+
+# The largest RMS distance, relative to the diagonal, that a goal without a tolerance means.
+DEFAULT_TOLERANCE = 5e-3
+# Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
+# many places, and repairing these costs more accuracy than a smooth one does from the start.
+LAM_SMP, LAM_SMOOTH = 0.05, 1.0
+
+TRACE_COLUMNS = (
+    "solver", "phase", "wall_s", "tau", "rms_mm", "max_mm", "hausdorff_mm", "smp_fraction", "forces", "ambiguous_fraction",
+)  # fmt: skip
+
+
+def problem_of(mesh: Mapping[str, np.ndarray], materials: MaterialCard, element: str) -> Problem:
+    """The dimensionless design problem of the `mesh` artifact."""
+    return build_problem(mesh["X"], mesh["X_temp"], mesh["tets"], mesh["clamp"], materials, element)
+
+
+def objective_weights(problem: Problem, goal: Goal, weights: Weights, rig: RigCard) -> ObjectiveWeights:
+    """Weights of the objective: the scene's, or else those that count an error of the goal's tolerance as 1."""
+    tolerance = DEFAULT_TOLERANCE if goal.tolerance is None else goal.tolerance / problem.length
+    return ObjectiveWeights(
+        error_scale=tolerance if weights.lam_pfinal is None else weights.lam_pfinal**-0.5,
+        lam_SMP=LAM_SMP if weights.lam_SMP is None else weights.lam_SMP,
+        lam_mat=0.0 if weights.lam_mat is None else weights.lam_mat,
+        lam_smooth=LAM_SMOOTH if weights.lam_smooth is None else weights.lam_smooth,
+        max_force=rig.max_force / problem.force,
+    )
+
+
+def patch_arrays(problem: Problem, patches: Patches, design: Design) -> dict[str, np.ndarray]:
+    """The five patch arrays of pipeline/README.md, in mm and N."""
+    return {
+        "patch_center": patches.centers,
+        "patch_faces": patches.faces,
+        "patch_offsets": patches.offsets,
+        "patch_held": patches.mean(design.median.x) * problem.length,
+        "patch_force": design.median.forces * problem.force,
+    }
+
+
+def patches_of(problem: Problem, arrays: Mapping[str, np.ndarray]) -> Patches:
+    """The patches of an artifact, for the problem's element."""
+    return patches_from_faces(problem, arrays["patch_center"], arrays["patch_faces"], arrays["patch_offsets"])
+
+
+def tau_seconds(equilibria: Equilibria, repeats: int = 3) -> float:
+    """The unit of work: the fastest of `repeats` factorisations of the scene's own stiffness matrix at rest, s."""
+    problem = equilibria.problem
+    data = equilibria.median_tangent(np.full(problem.n_tets, 0.5), problem.body.X)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        equilibria.held_analysis.factor(data)
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+class Trace:
+    """Rows of error-vs-time.csv, one for each iterate shown to it; tells the monitor of each."""
+
+    def __init__(self, problem: Problem, mesh: Mapping[str, np.ndarray], monitor: Monitor, tau_s: float) -> None:
+        self._problem, self._mesh, self._monitor, self._tau_s = problem, mesh, monitor, tau_s
+        self._areas = vertex_areas(mesh["X"], problem.faces)
+        self._start = time.perf_counter()
+        self.rows: list[dict[str, Any]] = []
+
+    def add(self, iterate: Iterate) -> None:
+        """Measure the true error of the iterate and append its row."""
+        wall_s = time.perf_counter() - self._start
+        n, design, problem = len(self._mesh["X"]), iterate.design, self._problem
+        error = shape_error(design.final.y[:n] * problem.length, self._mesh["X_temp"], problem.faces, self._areas)
+        row = {
+            "solver": "reduced",
+            "phase": iterate.phase,
+            "wall_s": wall_s,
+            "tau": wall_s / self._tau_s,
+            "rms_mm": error.rms,
+            "max_mm": error.max,
+            "hausdorff_mm": error.hausdorff,
+            "smp_fraction": float(problem.volume_fractions @ design.rho),
+            "forces": iterate.equilibria.patches.count,
+            "ambiguous_fraction": ambiguous_fraction(design.rho),
+        }
+        self.rows.append(row)
+        self._monitor.progress(
+            iterate.phase, rms_mm=error.rms, forces=row["forces"], smp_fraction=row["smp_fraction"], tau=row["tau"]
+        )
+
+    def csv(self) -> bytes:
+        """The rows as CSV with a header."""
+        return csv_bytes(TRACE_COLUMNS, self.rows)
