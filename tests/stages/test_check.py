@@ -448,6 +448,12 @@ def test_clamps_by_number_and_by_set_hold_the_vertices_of_the_file() -> None:
     np.testing.assert_array_equal(mesh["vertex_map"][mesh["clamp"]], [1, 2, 4, 5, 6])
 
 
+def test_a_box_whose_face_misses_vertices_by_rounding_catches_them() -> None:
+    almost = ClampRegion(box=((1e-12, 0, 0), (5 - 1e-12, 10, 10)))
+    mesh, _ = check_points(X, Y, clamp=(almost,))
+    np.testing.assert_array_equal(mesh["clamp"], X[:, 0] <= 5)
+
+
 def test_a_clamp_on_one_line_is_refused() -> None:
     with pytest.raises(MeshError, match=r"only vertices 0, 1, 2 of a piece, on one line"):
         check_points(X, Y, clamp=(ClampRegion(vertices=(0, 1, 2)),))
