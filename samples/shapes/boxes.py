@@ -3,12 +3,17 @@
 A hexahedron is eight vertices in bit order: corner k lies at (k & 1, k >> 1 & 1, k >> 2) of the cell's own axes.
 """
 
+from collections.abc import Callable
 from itertools import permutations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+Body = Callable[[FloatArray], FloatArray]
+"""Maps points (n, d) to values (n,), positive inside."""
 
 CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
 # One tet for each order in which the three axes can be walked from corner 0 to corner 7 (Kuhn's division).
@@ -72,11 +77,6 @@ def box(size: tuple[float, float, float], shape: tuple[int, int, int], division:
     return X, six_tets(X, hexes) if division == "six" else five_tets(X, hexes, grid_cells(shape))
 
 
-def kept_cells(X: FloatArray, hexes: IntArray, inside: BoolArray) -> tuple[FloatArray, IntArray]:
-    """The hexahedra marked in `inside` (c,) and their vertices alone."""
-    return compacted(X, hexes[inside])
-
-
 def merged(corners: FloatArray) -> tuple[FloatArray, IntArray]:
     """Vertices and hexahedra (c, 8) of cells given by `corners` (c, 8, 3); corners equal to 1e-6 become one vertex."""
     places, inverse = np.unique(np.round(corners.reshape(-1, 3), 6), axis=0, return_inverse=True)
@@ -88,3 +88,27 @@ def merged(corners: FloatArray) -> tuple[FloatArray, IntArray]:
 def cell_corners(cells: IntArray) -> FloatArray:
     """Corners (c, 8, 3) of unit cells at the cell numbers `cells` (c, 3)."""
     return (cells[:, None, :] + CORNERS).astype(np.float64)
+
+
+def filled(body: Body, low: ArrayLike, high: ArrayLike, cell: ArrayLike) -> tuple[FloatArray, IntArray]:
+    """Five tets for each of the cells (size `cell`, mm) of the box low..high whose centre lies inside `body`."""
+    start, size = np.asarray(low, np.float64), np.broadcast_to(np.asarray(cell, np.float64), 3)
+    n = np.ceil((np.asarray(high) - start) / size - 1e-9).astype(int)
+    shape = (int(n[0]), int(n[1]), int(n[2]))
+    cells = grid_cells(shape)
+    inside = without_edge_contacts((body(start + size * (cells + 0.5)) > 0).reshape(shape[::-1])).ravel()
+    X = grid_vertices(*(start[a] + size[a] * np.arange(n[a] + 1) for a in range(3)))
+    X, hexes = compacted(X, grid_hexes(shape)[inside])
+    return X, five_tets(X, hexes, cells[inside])
+
+
+def without_edge_contacts(inside: BoolArray) -> BoolArray:
+    """`inside` with cells added until no two cells touch along an edge alone."""
+    grown = inside.copy()
+    for axis in range(3):
+        planes = np.moveaxis(grown, axis, 0)
+        a, b, c, d = planes[:, :-1, :-1], planes[:, 1:, :-1], planes[:, :-1, 1:], planes[:, 1:, 1:]
+        rising, falling = a & d & ~b & ~c, b & c & ~a & ~d
+        b |= rising
+        a |= falling
+    return grown if np.array_equal(grown, inside) else without_edge_contacts(grown)

@@ -8,6 +8,7 @@ from shapes import face, fish
 from shapes import gripper as grip
 from shapes import tower as lattice
 from shapes.boxes import box
+from shapes.on_demand import ON_DEMAND
 from shapes.plates import outline_triangles, thickened
 from shapes.scene import Sample
 from shapes.stuffing import stuffed
@@ -91,5 +92,5 @@ COMMITTED: dict[str, Callable[[], Sample]] = {
     "smiley": smiley,
     "snake": snake,
 }
-ON_DEMAND: dict[str, Callable[[], Sample]] = {}
+
 SAMPLES = COMMITTED | ON_DEMAND

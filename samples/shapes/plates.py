@@ -1,12 +1,11 @@
 """Flat plates of any outline: near-equilateral triangles in the plane, thickened to prisms and tets."""
 
-from collections.abc import Iterable
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fab4d.mesh.tetmesh import FloatArray, IntArray
-from shapes.boxes import compacted, positively_oriented
-from shapes.stuffing import Body, cut_points, moved_onto_surface
+from shapes.boxes import Body, compacted, positively_oriented
+from shapes.stuffing import cut_points, moved_onto_surface
 
 # A lattice vertex moves onto the outline when the outline cuts an edge at it nearer than this share of the edge.
 NEAR = 0.4
@@ -27,7 +26,7 @@ def triangle_lattice(low: FloatArray, high: FloatArray, h: float) -> tuple[Float
     return X, np.concatenate([lower, upper])
 
 
-def outline_triangles(body: Body, low: Iterable[float], high: Iterable[float], h: float) -> tuple[FloatArray, IntArray]:
+def outline_triangles(body: Body, low: ArrayLike, high: ArrayLike, h: float) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 2) and triangles of the plane region where `body` is positive, from triangles of side `h`, mm."""
     X, triangles = triangle_lattice(np.asarray(low, np.float64), np.asarray(high, np.float64), h)
     signs = np.sign(body(X)).astype(np.int64)

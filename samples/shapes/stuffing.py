@@ -5,17 +5,14 @@ lattice. A tet of it is (0, 1, 2, 3): 0-1 joins two cell centres and 2-3 two cel
 the other four edges are short.
 """
 
-from collections.abc import Callable, Iterable
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import TET_EDGES
-from shapes.boxes import compacted, grid_cells, grid_vertices, positively_oriented
-
-Body = Callable[[FloatArray], FloatArray]
-"""Maps points (n, 3) to values (n,), positive inside."""
+from shapes.boxes import Body, compacted, grid_cells, grid_vertices, positively_oriented
 
 # A lattice vertex moves onto the surface when the surface cuts an edge at it nearer than this share of the edge.
 NEAR_LONG, NEAR_SHORT = 0.24999, 0.41189
@@ -49,7 +46,7 @@ def _tets_across(axis: int, shape: IntArray, n_corners: int) -> IntArray:
     return np.concatenate(rows)
 
 
-def stuffed(body: Body, low: Iterable[float], high: Iterable[float], h: float | Iterable[float]) -> tuple:
+def stuffed(body: Body, low: ArrayLike, high: ArrayLike, h: ArrayLike) -> tuple[FloatArray, IntArray]:
     """Vertices (n, 3) and tets (m, 4) of `body` inside the box low..high, from lattice cells of size `h` (mm)."""
     cell = np.broadcast_to(np.asarray(h, np.float64), 3)
     X, tets = bcc_lattice(np.asarray(low, np.float64), np.asarray(high, np.float64), cell)
@@ -150,8 +147,9 @@ def stencil(signs: tuple[int, ...]) -> list[tuple[Corner, ...]]:
 
 
 def _one_outside(c: int) -> list[tuple[Corner, ...]]:
-    top = [c ^ 1, *(k for k in range(4) if k not in (c, c ^ 1))]
-    return _prism(top, [(k, c) for k in top])
+    others = [k for k in range(4) if k not in (c, c ^ 1)]
+    top: list[Corner] = [c ^ 1, *others]
+    return _prism(top, [(k, c) for k in (c ^ 1, *others)])
 
 
 def _two_and_two(plus: list[int], minus: list[int]) -> list[tuple[Corner, ...]]:

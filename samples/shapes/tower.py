@@ -1,9 +1,12 @@
 """A lattice tower on four feet: legs, rings and diagonals, each one cell thick, on a footprint that narrows upwards."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from fab4d.mesh.tetmesh import FloatArray, IntArray
-from shapes.boxes import cell_corners, merged, six_tets
+from shapes.boxes import Body, cell_corners, merged, six_tets
+from shapes.implicit import capsule, filleted
 
 HEIGHT, BAYS, LAYERS = 200.0, 12, 3
 FOOT = 1  # layers below the first bay
@@ -73,3 +76,27 @@ def lattice_tower() -> tuple[FloatArray, IntArray]:
     z = np.interp(places[:, 2], np.arange(len(heights)), heights)
     X = np.column_stack([_line(places[:, 0], z), _line(places[:, 1], z), z])
     return X, six_tets(X, hexes)
+
+
+# The tower of round struts: half width of the footprint at bottom and top, heights of its rings, mm.
+BOTTOM, TOP, RINGS = 34.0, 11.0, (0.0, 52.0, 98.0, 138.0, 170.0, 196.0)
+
+FILLET = 5.0
+
+
+def _corner(z: float, i: int, j: int) -> tuple[float, float, float]:
+    half = BOTTOM + (TOP - BOTTOM) * z / RINGS[-1]
+    return (i * half, j * half, z)
+
+
+def round_struts() -> Body:
+    """A tower of four round legs, rings and one diagonal in each opening; it stands on z = 0."""
+    sides = [((-1, -1), (1, -1)), ((1, -1), (1, 1)), ((1, 1), (-1, 1)), ((-1, 1), (-1, -1))]
+    parts = [capsule(_corner(0.0, *a), _corner(RINGS[-1], *a), 5.5, 5.0) for a, _ in sides]
+    for below, above in pairwise(RINGS):
+        for number, (a, b) in enumerate(sides):
+            parts.append(capsule(_corner(above, *a), _corner(above, *b), 4.8))
+            ends = (a, b) if (number + RINGS.index(above)) % 2 else (b, a)
+            parts.append(capsule(_corner(below, *ends[0]), _corner(above, *ends[1]), 4.8))
+    whole = filleted(FILLET, *parts)
+    return lambda P: np.minimum(whole(P), P[:, 2])

@@ -59,6 +59,11 @@ def section_coordinates(X: FloatArray, line: Rod) -> FloatArray:
     return (X - line.origin) @ line.frame.T
 
 
+def _middles(step: float) -> FloatArray:
+    """Positions along a rod of the middles of its steps."""
+    return np.asarray(step * (np.arange(STEPS) + 0.5), np.float64)
+
+
 def curvature(s: FloatArray, length: float, turns: tuple[Turn, ...]) -> FloatArray:
     """Rotation of the sections per length about the three body axes, (len(s), 3), rad/mm, for equally spaced s."""
     total = np.zeros((len(s), 3))
@@ -76,7 +81,7 @@ def warped(X: FloatArray, line: Rod, turns: tuple[Turn, ...], stretch: float = 1
     The curvature is constant in each of STEPS steps; within a step the line is followed by the midpoint rule.
     """
     step = line.length / STEPS
-    kappa = curvature(step * (np.arange(STEPS) + 0.5), line.length, turns)
+    kappa = curvature(_middles(step), line.length, turns)
     frames, points = _march(kappa, step, stretch)
     local = section_coordinates(X, line)
     s = np.clip(local[:, 0], 0.0, line.length)
@@ -87,6 +92,19 @@ def warped(X: FloatArray, line: Rod, turns: tuple[Turn, ...], stretch: float = 1
     centre = points[index] + middle.apply([1.0, 0.0, 0.0]) * rest * stretch
     off_line = np.column_stack([local[:, 0] - s, local[:, 1:]])
     return line.origin + (centre + frame.apply(off_line)) @ line.frame
+
+
+def domed(X: FloatArray, start: float, end: float, mid: float, degrees: float) -> FloatArray:
+    """Positions (n, 3), mm, after every radius of a plate around the z axis has bent down by `degrees`.
+
+    The bend lies between the radii `start` and `end`; `mid` is the height of the neutral surface.
+    """
+    radius = np.hypot(X[:, 0], X[:, 1])
+    meridian = np.column_stack([radius, np.zeros_like(radius), X[:, 2]])
+    line = rod((start, 0, mid), (end, 0, mid), (0, 0, 1))
+    bent = warped(meridian, line, (Turn((0, 0, 1), -degrees, lambda s: ramp(s, 0, 0.3 * line.length)),))
+    scale = np.where(radius > start, bent[:, 0] / np.maximum(radius, start), 1.0)
+    return np.column_stack([scale * X[:, 0], scale * X[:, 1], bent[:, 2]])
 
 
 def moved_together(X: FloatArray, *positions: FloatArray) -> FloatArray:
@@ -114,11 +132,11 @@ def twisted_plate(X: FloatArray, line: Rod, degrees: float, profile: Profile, wi
     """
     step = line.length / STEPS
     turn = Turn((1, 0, 0), degrees, profile)
-    rates = curvature(step * (np.arange(STEPS) + 0.5), line.length, (turn,))[:, 0]
+    rates = curvature(_middles(step), line.length, (turn,))[:, 0]
     lengths = np.sqrt(1.0 - rates**2 * width**2 / 12.0)
     s, a, b = section_coordinates(X, line).T
     on_line = np.clip(s, 0.0, line.length)
-    nodes, middles = step * np.arange(STEPS + 1), step * (np.arange(STEPS) + 0.5)
+    nodes, middles = step * np.arange(STEPS + 1), _middles(step)
     phi = np.interp(on_line, nodes, np.r_[0.0, np.cumsum(rates * step)])
     along = np.interp(on_line, nodes, np.r_[0.0, np.cumsum(lengths * step)]) + s - on_line
     length = np.where(s <= 0.0, 1.0, np.interp(on_line, middles, lengths))
