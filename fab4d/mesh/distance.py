@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import FloatArray, IntArray
@@ -87,6 +88,17 @@ def surface_distances(points: FloatArray, b: FloatArray, faces: IntArray) -> Flo
     """Distance (k,) of each point (k, 3) to the surface with vertices b (n, 3) and triangles `faces`, mm."""
     tree = box_tree(b[faces[_spatial_order(b[faces])]])
     return np.sqrt(_distances(np.ascontiguousarray(points, dtype=np.float64), *tree))
+
+
+def largest_surface_distance(points: FloatArray, b: FloatArray, faces: IntArray) -> float:
+    """The largest of `surface_distances`, mm, without computing most of them.
+
+    The distance to the nearest vertex of the surface bounds that to the surface.
+    """
+    bound = cKDTree(b[_used(faces)]).query(points)[0] ** 2
+    order = np.argsort(-bound, kind="stable")
+    tree = box_tree(b[faces[_spatial_order(b[faces])]])
+    return float(np.sqrt(_largest_distance(points[order], bound[order], 0.0, *tree)))
 
 
 def box_tree(triangles: FloatArray) -> BoxTree:

@@ -11,6 +11,8 @@ from fab4d.mesh.tetmesh import FloatArray, IntArray
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 SHORTEST = 0.15
 """Shortest distance worth a caliper, as a part of the diagonal."""
+APART = 0.1
+"""Least distance of two candidates, as a part of the diagonal: neighbours say the same."""
 NEWS = 0.02
 """How much the three distances of a pair must differ from those of the pairs before it, as a part of the diagonal."""
 
@@ -42,11 +44,11 @@ def caliper_checks(
     X, x, y : (n, 3) permanent, median, final, mm       faces : (b, 3)
     preferred : vertices to choose from besides the corners of the part, such as the centres of the pads
     """
-    candidates = np.unique(np.concatenate([extreme_vertices(X, faces), preferred]))
+    L0 = bounding_box_diagonal(X)
+    candidates = _apart(X, np.concatenate([preferred, extreme_vertices(X, faces)]), APART * L0)
     i, j = np.triu_indices(len(candidates), 1)
     pairs = np.column_stack([candidates[i], candidates[j]])
     d = [_distances(shape, pairs) for shape in (X, x, y)]
-    L0 = bounding_box_diagonal(X)
     usable = np.min(d, axis=0) > SHORTEST * L0
     score = np.where(usable, np.abs(d[2] - d[0]) + np.abs(d[2] - d[1]), -1.0)
     chosen = _spread(pairs, np.column_stack(d), score, n_pairs, NEWS * L0)
@@ -57,6 +59,15 @@ def extreme_vertices(X: FloatArray, faces: IntArray) -> IntArray:
     """The boundary vertices farthest along the 26 directions to the neighbours of a cube."""
     surface = np.unique(faces)
     return np.unique(surface[np.argmax(X[surface] @ DIRECTIONS.T, axis=0)])
+
+
+def _apart(X: FloatArray, vertices: IntArray, least: float) -> IntArray:
+    """The vertices, taken in turn, that are at least `least` mm from all taken before; ascending."""
+    kept: list[int] = []
+    for v in vertices:
+        if not kept or np.linalg.norm(X[kept] - X[v], axis=1).min() >= least:
+            kept.append(int(v))
+    return np.sort(np.array(kept, np.int64))
 
 
 def _distances(shape: FloatArray, pairs: IntArray) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from fab4d.materials.cards import MaterialCard
-from fab4d.mesh.distance import surface_distances
+from fab4d.mesh.distance import largest_surface_distance
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import unique_edges
 
@@ -49,7 +49,7 @@ def thickness(X: FloatArray, tets: IntArray, faces: IntArray) -> float:
     """
     edges, _ = unique_edges(tets)
     centers = np.concatenate([X[np.unique(tets)], X[edges].mean(axis=1), X[tets].mean(axis=1)])
-    return 2.0 * float(surface_distances(centers, X, faces).max())
+    return 2.0 * largest_surface_distance(centers, X, faces)
 
 
 def conduction_time(wall: float, film: float, density: float, remaining: float) -> float:

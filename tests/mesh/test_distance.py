@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fab4d.mesh.distance import (
     aligned_hausdorff_distance,
     hausdorff_distance,
+    largest_surface_distance,
     shape_error,
     surface_distances,
 )
@@ -57,6 +58,7 @@ def test_tree_search_equals_brute_force():
     points = 2 * rng.normal(size=(60, 3))
     brute = [min(brute_distance(p, t) for t in X[faces]) for p in points]
     np.testing.assert_allclose(surface_distances(points, X, faces), brute, rtol=1e-12, atol=1e-12)
+    assert largest_surface_distance(points, X, faces) == pytest.approx(max(brute), rel=1e-12)
 
 
 def test_degenerate_triangles_are_segments_and_points():
