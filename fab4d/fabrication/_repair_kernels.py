@@ -1,6 +1,6 @@
 """Compiled local search that makes the labels of a tet mesh well composed. `wellcomposed.py` explains it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -8,7 +8,11 @@ from numba import njit
 from fab4d.fabrication._links import Links
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
+# Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile.
+_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_inner = njit(cache=True, **_NO_ENTRY)
 FREE, LOCK_STEPS, MOST_FLIPS, MOST_SKIPS = -1, 12, 6, 40
+EACH_TET, WHOLE_STAR = -2, -1
 
 
 class State(NamedTuple):
@@ -35,6 +39,7 @@ class Scratch(NamedTuple):
     """(n + 1,) the last entry counts."""
     members: IntArray
     best: IntArray
+    nodes: IntArray
 
 
 class Queue(NamedTuple):
@@ -45,7 +50,7 @@ class Queue(NamedTuple):
     ends: IntArray
 
 
-@njit(cache=True)
+@_inner
 def _root(parent: IntArray, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -53,7 +58,7 @@ def _root(parent: IntArray, i: int) -> int:
     return i
 
 
-@njit(cache=True)
+@_inner
 def _boundary_excess(v: int, value: bool, links: Links, scratch: Scratch) -> int:
     """How far the boundary of one material is from a single cycle in the link of v; fills scratch.degree."""
     degree, parent, bits = scratch.degree, scratch.parent, scratch.bits
@@ -76,14 +81,14 @@ def _boundary_excess(v: int, value: bool, links: Links, scratch: Scratch) -> int
     return excess + max(0, touched - joined - 1)
 
 
-@njit(cache=True)
+@_inner
 def _load_bits(v: int, smp: BoolArray, links: Links, scratch: Scratch) -> None:
     start = links.star_start[v]
     for k in range(links.star_start[v + 1] - start):
         scratch.bits[k] = smp[links.star[start + k]]
 
 
-@njit(cache=True)
+@_inner
 def vertex_defects(v: int, pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
     """Surplus cycles and four-face edges of both materials at v; inside the part both have the same boundary.
 
@@ -109,9 +114,12 @@ def all_defects(pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scrat
     return defects
 
 
-@njit(cache=True)
+@_inner
 def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
-    """scratch.group: component of each tet of the star (equal labels, joined by faces); with node >= 0 at that edge."""
+    """scratch.group: component of each tet of the star (equal labels, joined by faces); of node >= 0 at that edge only.
+
+    With node EACH_TET every tet is a group by itself.
+    """
     size = links.star_start[v + 1] - links.star_start[v]
     parent, group, bits = scratch.parent, scratch.group, scratch.bits
     for k in range(size):
@@ -123,14 +131,14 @@ def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
             group[a] = 0
             if b >= 0:
                 group[b] = 0
-                if bits[a] == bits[b]:
+                if bits[a] == bits[b] and node != EACH_TET:
                     parent[_root(parent, a)] = _root(parent, b)
     for k in range(size):
         if group[k] == 0:
             group[k] = _root(parent, k)
 
 
-@njit(cache=True)
+@_inner
 def _gather(v: int, group: int, links: Links, scratch: Scratch) -> int:
     """The tets of one group into scratch.members; returns how many."""
     start, count = links.star_start[v], 0
@@ -141,19 +149,19 @@ def _gather(v: int, group: int, links: Links, scratch: Scratch) -> int:
     return count
 
 
-@njit(cache=True)
+@_inner
 def _flip(tets: IntArray, state: State) -> None:
     for t in tets:
         state.smp[t] = not state.smp[t]
 
 
-@njit(cache=True)
+@_inner
 def _fresh_stamp(scratch: Scratch) -> int:
     scratch.stamp[-1] += 1
     return scratch.stamp[-1]
 
 
-@njit(cache=True)
+@_inner
 def _change(tets: IntArray, state: State, links: Links, scratch: Scratch) -> int:
     """Change of the number of defects when `tets` flip."""
     _flip(tets, state)
@@ -167,7 +175,7 @@ def _change(tets: IntArray, state: State, links: Links, scratch: Scratch) -> int
     return change
 
 
-@njit(cache=True)
+@_inner
 def _allowed(tets: IntArray, step: int, state: State) -> bool:
     only = state.only[0]
     for t in tets:
@@ -179,7 +187,7 @@ def _allowed(tets: IntArray, step: int, state: State) -> bool:
     return True
 
 
-@njit(cache=True)
+@_inner
 def _price(tets: IntArray, state: State) -> float:
     """What a flip of `tets` costs: little where it brings the original label back."""
     price = 0.0
@@ -188,7 +196,7 @@ def _price(tets: IntArray, state: State) -> float:
     return price
 
 
-@njit(cache=True)
+@_inner
 def _try(count: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
     """`best` (rank, price, count), or the move scratch.members[:count] if it is better (kept in scratch.best)."""
     tets = scratch.members[:count]
@@ -203,45 +211,38 @@ def _try(count: int, step: int, best: tuple, state: State, links: Links, scratch
     return rank, price, count
 
 
-@njit(cache=True)
-def _try_groups(v: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
-    size = links.star_start[v + 1] - links.star_start[v]
-    groups = scratch.group[:size].copy()
-    for k in range(size):
-        if groups[k] == k:
-            scratch.group[:size] = groups
-            count = _gather(v, k, links, scratch)
-            if count > 1:
-                best = _try(count, step, best, state, links, scratch)
-    return best
+@_inner
+def _kinds_of_moves(v: int, state: State, links: Links, scratch: Scratch) -> int:
+    """EACH_TET, WHOLE_STAR and the four-face edges at v into scratch.nodes; returns how many."""
+    scratch.nodes[0], scratch.nodes[1], count = EACH_TET, WHOLE_STAR, 2
+    _load_bits(v, state.smp, links, scratch)
+    for value in (True, False):
+        _boundary_excess(v, value, links, scratch)
+        for node in range(links.n_nodes[v]):
+            if scratch.degree[node] > 2:
+                scratch.nodes[count] = node
+                count += 1
+    return count
 
 
-@njit(cache=True)
+@_inner
 def _best_move(v: int, step: int, worst: int, state: State, links: Links, scratch: Scratch) -> int:
     """The cheapest flip at v of rank below `worst` into scratch.best; returns its number of tets, 0 if there is none.
 
     Moves: one tet of the star, one component of the star, one sector around a four-face edge.
     """
     best = (worst, 0.0, 0)
-    for k in range(links.star_start[v], links.star_start[v + 1]):
-        scratch.members[0] = links.star[k]
-        best = _try(1, step, best, state, links, scratch)
-    _load_bits(v, state.smp, links, scratch)
-    _group_tets(v, -1, links, scratch)
-    best = _try_groups(v, step, best, state, links, scratch)
-    for value in (True, False):
+    size = links.star_start[v + 1] - links.star_start[v]
+    for i in range(_kinds_of_moves(v, state, links, scratch)):
         _load_bits(v, state.smp, links, scratch)
-        _boundary_excess(v, value, links, scratch)
-        degree = scratch.degree[: links.n_nodes[v]].copy()
-        for node in range(len(degree)):
-            if degree[node] > 2:
-                _load_bits(v, state.smp, links, scratch)
-                _group_tets(v, node, links, scratch)
-                best = _try_groups(v, step, best, state, links, scratch)
+        _group_tets(v, scratch.nodes[i], links, scratch)
+        for k in range(size):
+            if scratch.group[k] == k:
+                best = _try(_gather(v, k, links, scratch), step, best, state, links, scratch)
     return best[2]
 
 
-@njit(cache=True)
+@_inner
 def _push(v: int, on_top: bool, queue: Queue) -> None:
     if queue.waiting[v]:
         return
@@ -253,7 +254,7 @@ def _push(v: int, on_top: bool, queue: Queue) -> None:
     queue.ring[slot % len(queue.ring)] = v
 
 
-@njit(cache=True)
+@_inner
 def _pop(queue: Queue) -> int:
     queue.ends[1] -= 1
     v = queue.ring[(queue.ends[0] + queue.ends[1]) % len(queue.ring)]
@@ -261,7 +262,7 @@ def _pop(queue: Queue) -> int:
     return v
 
 
-@njit(cache=True)
+@_inner
 def _apply(count: int, step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> None:
     tets = scratch.best[:count].copy()
     _flip(tets, state)

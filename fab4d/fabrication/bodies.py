@@ -88,7 +88,8 @@ def snapped(X: FloatArray) -> FloatArray:
     """X (n, 3) rounded to multiples of 2^-14 mm; beyond 1 m, of the finest step that float32 holds."""
     largest = float(np.abs(X).max(initial=1.0))
     step = max(FINEST_STEP, 2.0 ** (math.ceil(math.log2(largest)) - 24))
-    return np.round(X / step) * step
+    # Adding zero turns -0.0 into 0.0.
+    return np.round(X / step) * step + 0.0
 
 
 def _body(name: str, points: FloatArray, faces: IntArray) -> Body | None:

@@ -71,7 +71,7 @@ def _state(
 
 def _scratch(links: Links) -> Scratch:
     size = int(max(np.diff(links.star_start).max(), links.n_nodes.max())) + 1
-    sizes = (size, size, size, len(links.n_nodes) + 1, size, size)
+    sizes = (size, size, size, len(links.n_nodes) + 1, size, size, 2 * size + 2)
     return Scratch(np.zeros(size, bool), *(np.zeros(s, np.int64) for s in sizes))
 
 

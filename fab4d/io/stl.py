@@ -41,6 +41,5 @@ def stl_arrays(data: bytes, name: str) -> tuple[FloatArray, IntArray]:
         msg = f"{name}: {len(data)} bytes are not a binary STL file of {count} triangles; write it again"
         raise BodyError(msg)
     corners = np.frombuffer(data, _TRIANGLE, count, start)["corners"].reshape(-1, 3)
-    # Adding zero makes -0.0 and 0.0 one number.
-    vertices, faces = np.unique(corners.astype(np.float64) + 0.0, axis=0, return_inverse=True)
+    vertices, faces = np.unique(corners.astype(np.float64), axis=0, return_inverse=True)
     return vertices, faces.reshape(-1, 3).astype(np.int64)
