@@ -1,7 +1,9 @@
 """The two equilibria of model.md section 2: the held, hot median shape and the free, cold final shape."""
+# mypy: disable-error-code="call-arg"  # numba types a compiled function called with *args as one without any
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +15,9 @@ from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.solvers.linear import Analysis, Factor, analyse
 from fab4d.solvers.newton import Residual, Solution, newton
 
-
-# Compliance of the rig, dimensionless: a patch is held at `held` up to this times its force, W x + RIG_COMPLIANCE f = held.
-# It is some 1e-5 of the compliance of a patch of the part, and keeps the KKT matrix quasi-definite, which a factorisation
-# without pivoting between supernodes needs. The equilibrium is exact whatever it is.
+# Compliance of the rig, dimensionless: W x + RIG_COMPLIANCE f = held. It is some 1e-5 of the compliance of a patch of
+# the part, and keeps the KKT matrix quasi-definite, which a factorisation without pivoting between supernodes needs.
+# The equilibrium is exact whatever it is.
 RIG_COMPLIANCE = 1e-4
 
 
@@ -110,7 +111,7 @@ class Equilibria:
 
     @cached_property
     def block_structure(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Sorting of the element blocks (a, b) by row and column node: order, first of each sum, column nodes, row starts."""
+        """Sorting of the element blocks (a, b) by nodes: order, first of each sum, column nodes, row starts."""
         elements, n_nodes = self.problem.body.elements, self.problem.n_nodes
         keys = (elements[:, :, None] * n_nodes + elements[:, None, :]).ravel()
         order = np.argsort(keys, kind="stable")
@@ -118,7 +119,7 @@ class Equilibria:
         unique = keys[order][starts]
         return order, starts, unique % n_nodes, np.searchsorted(unique // n_nodes, np.arange(n_nodes + 1))
 
-    # -- median ------------------------------------------------------------------------------------------------------
+    # -- median
     def median_gradient(self, rho: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
         """dW_med/dx (N, 3), W_med and min det F."""
         body = self.problem.body
@@ -185,8 +186,10 @@ class Equilibria:
         kernels.deformed_gradients(self.problem.body.elements, self.problem.body.dN, x - self.problem.body.X, gradients)
         return Median(x, solution.z[n:].reshape(-1, 3), solution, gradients)
 
-    # -- final -------------------------------------------------------------------------------------------------------
-    def _final_terms(self, rho: FloatArray, median: Median, y: FloatArray, unloaded: float = 1.0) -> list[tuple]:
+    # -- final
+    def _final_terms(
+        self, rho: FloatArray, median: Median, y: FloatArray, unloaded: float = 1.0
+    ) -> list[tuple[Any, ...]]:
         """Kernel arguments of the glassy and the TPE term; zero moduli mark elements without that material.
 
         unloaded : share of the TPE that pulls back; the rest is taken as stress-free in the median shape
@@ -204,8 +207,8 @@ class Equilibria:
     ) -> tuple[FloatArray, float]:
         """dW_fin/dy (N, 3) and W_fin (inf where an element is inverted)."""
         g, total = np.zeros_like(y), 0.0
-        for term in self._final_terms(rho, median, y, unloaded):
-            total += kernels.gradient(*term, g)[0]
+        for element_loop in self._final_terms(rho, median, y, unloaded):
+            total += kernels.gradient(*element_loop, g)[0]
         return g, total
 
     def final_tangent(
@@ -215,8 +218,8 @@ class Equilibria:
         pattern = self.free_pattern
         data = np.zeros(pattern.nnz)
         assemble = kernels.tangent_spd if spd else kernels.tangent
-        for term in self._final_terms(rho, median, y, unloaded):
-            assemble(*term, pattern.rank, pattern.indptr, data)
+        for element_loop in self._final_terms(rho, median, y, unloaded):
+            assemble(*element_loop, pattern.rank, pattern.indptr, data)
         self.free_mask.apply(data, 1.0)
         return data
 
@@ -229,8 +232,9 @@ class Equilibria:
         max_iterations: int = 25,
         unloaded: float = 1.0,
     ) -> Final:
-        """Final shape after unloading, from the guess y; the tolerance is relative to the TPE's pull at the median shape.
+        """Final shape after unloading, from the guess y.
 
+        tolerance : relative to the TPE's pull at the median shape
         unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape.
         """
         shape, fixed = y.shape, self.free_mask.fixed

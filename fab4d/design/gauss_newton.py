@@ -17,9 +17,13 @@ from fab4d.design.objective import (
     objective_value,
     shape_error,
     shape_metric,
+    stretch_excess,
 )
-from fab4d.design.sensitivity import Linearisation, linearise
+from fab4d.design.sensitivity import Change, Linearisation, linearise
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
+
+# Relative residual at which an iterate counts as in equilibrium; the delivered state is solved to rounding.
+SEARCH_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +43,7 @@ def equilibrate(
     x: FloatArray,
     forces: FloatArray,
     y: FloatArray,
-    tolerance: float = 1e-8,
+    tolerance: float = SEARCH_TOLERANCE,
     max_iterations: int = 12,
 ) -> Design | None:
     """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found."""
@@ -60,7 +64,8 @@ class Model:
 
     gradient_rho (m,), gradient_c (3K,) : gradient of the objective
     dy_dc (3N, 3K), df_dc (3K, 3K) : derivatives of final shape and forces with respect to the held positions
-    force_rows (k, 3K) : d(excess)/df of the forces beyond the limit, times sqrt(2 limit)
+    dx_dc (3N, 3K) : derivative of the median shape with respect to the held positions
+    force_rows (k, 3K), stretch_rows (k, 3N) : derivatives of the active limits
     H_cc (3K, 3K) : Gauss-Newton Hessian of the held positions
     """
 
@@ -68,9 +73,11 @@ class Model:
     metric: ShapeMetric
     gradient_rho: FloatArray
     gradient_c: FloatArray
-    dy_dc: FloatArray
+    dx_dc: FloatArray
     df_dc: FloatArray
+    dy_dc: FloatArray
     force_rows: FloatArray
+    stretch_rows: csr_array
     H_cc: FloatArray
     terms: DensityTerms
     L: csr_array
@@ -94,28 +101,32 @@ class DampedModel:
     def _held(self, rhs: FloatArray) -> FloatArray:
         return cho_solve(self.held_factor, rhs) if self.held_factor is not None else np.zeros(0)
 
-    def _pull_back(self, dy: FloatArray, df: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradients with respect to y (3N,) and f (3K,) of the quadratic terms at dy, df."""
-        rows = self.model.force_rows
-        return self.model.metric.apply(dy), rows.T @ (rows @ df)
+    def _pull_back(self, change: Change) -> Change:
+        """Gradients of the quadratic terms with respect to x, f and y at a change of these."""
+        rows, stretch = self.model.force_rows, self.model.stretch_rows
+        return Change(stretch.T @ (stretch @ change.x), rows.T @ (rows @ change.f), self.model.metric.apply(change.y))
 
-    def _onto_held(self, gy: FloatArray, gf: FloatArray) -> FloatArray:
-        return self.model.dy_dc.T @ gy + self.model.df_dc.T @ gf
+    def _onto_held(self, g: Change) -> FloatArray:
+        m = self.model
+        return m.dx_dc.T @ g.x + m.df_dc.T @ g.f + m.dy_dc.T @ g.y
+
+    def _from_held(self, dc: FloatArray) -> Change:
+        m = self.model
+        return Change(m.dx_dc @ dc, m.df_dc @ dc, m.dy_dc @ dc)
 
     def reduced_gradient(self) -> FloatArray:
         """(m,) gradient with respect to rho once the held positions have made their best step."""
         m = self.model
-        dc = -self._held(m.gradient_c)
-        gy, gf = self._pull_back(m.dy_dc @ dc, m.df_dc @ dc)
-        return m.gradient_rho + m.lin.adjoint_rho(gf, gy)
+        response = self._from_held(-self._held(m.gradient_c))
+        return m.gradient_rho + m.lin.adjoint_rho(self._pull_back(response))
 
     def hessian(self, v: FloatArray) -> FloatArray:
         """Damped Gauss-Newton Hessian of rho, held positions eliminated, times v (m,)."""
         m = self.model
-        dy, df = m.lin.forward_rho(v)
-        dc = -self._held(self._onto_held(*self._pull_back(dy, df)))
-        gy, gf = self._pull_back(dy + m.dy_dc @ dc, df + m.df_dc @ dc)
-        return m.lin.adjoint_rho(gf, gy) + (m.terms.curvature + self.damping) * v + 2 * m.lam_smooth * (m.L @ v)
+        direct = m.lin.forward_rho(v)
+        indirect = self._from_held(-self._held(self._onto_held(self._pull_back(direct))))
+        g = self._pull_back(Change(direct.x + indirect.x, direct.f + indirect.f, direct.y + indirect.y))
+        return m.lin.adjoint_rho(g) + (m.terms.curvature + self.damping) * v + 2 * m.lam_smooth * (m.L @ v)
 
     def diagonal(self) -> FloatArray:
         """(m,) the part of the Hessian's diagonal that costs nothing: the Jacobi preconditioner."""
@@ -125,8 +136,7 @@ class DampedModel:
     def held_step(self, drho: FloatArray) -> FloatArray:
         """(K, 3) the held-position change that minimises the model for a given drho (m,)."""
         m = self.model
-        dy, df = m.lin.forward_rho(drho)
-        return -self._held(m.gradient_c + self._onto_held(*self._pull_back(dy, df))).reshape(-1, 3)
+        return -self._held(m.gradient_c + self._onto_held(self._pull_back(m.lin.forward_rho(drho)))).reshape(-1, 3)
 
 
 def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design) -> Model:
@@ -136,19 +146,25 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
     error = shape_error(problem, design.final.y)
     gy = 2 * problem.area_weights[:, None] * (error.e @ error.R) / weights.error_scale**2
     rows, excess = _force_rows(weights, f)
-    g_rho, g_c = lin.adjoint(np.zeros_like(gy), (rows.T @ excess).reshape(-1, 3), gy)
+    stretch = stretch_excess(problem, weights, design.rho, design.median.x)
+    gx, gf = (stretch.rows.T @ stretch.values).reshape(-1, 3), (rows.T @ excess).reshape(-1, 3)
+    g_rho, g_c = lin.adjoint(gx, gf, gy)
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
     metric = shape_metric(problem, design.final.y, weights.error_scale)
-    _, df_dc, dy_dc = lin.held_columns()
-    H = dy_dc.T @ metric.apply(dy_dc) + (rows @ df_dc).T @ (rows @ df_dc)
+    dx_dc, df_dc, dy_dc = lin.held_columns()
+    H = dy_dc.T @ metric.apply(dy_dc)
+    for limited in (rows @ df_dc, stretch.rows @ dx_dc):
+        H += limited.T @ limited
     return Model(
         lin=lin,
         metric=metric,
         gradient_rho=g_rho + terms.gradient,
         gradient_c=g_c.ravel(),
-        dy_dc=dy_dc,
+        dx_dc=dx_dc,
         df_dc=df_dc,
+        dy_dc=dy_dc,
         force_rows=rows,
+        stretch_rows=stretch.rows,
         H_cc=0.5 * (H + H.T),
         terms=terms,
         L=L,
@@ -231,11 +247,11 @@ def evaluate(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, de
     """The objective at a design."""
     problem = equilibria.problem
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
-    return objective_value(problem, weights, terms, design.median, design.final)
+    return objective_value(problem, weights, terms, design.rho, design.median, design.final)
 
 
 def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | None, n_cg: int = 30) -> FloatArray:
-    """Change of rho (m,) that lowers the model within 0 <= rho <= 1: CG on the free tets, then again without those hit."""
+    """Change of rho (m,) that lowers the model within 0 <= rho <= 1: CG on the free tets, again without those hit."""
     drho = np.zeros_like(rho)
     if movable is not None and not movable.any():
         return drho

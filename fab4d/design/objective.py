@@ -17,7 +17,8 @@ class ObjectiveWeights:
 
     lam_round weighs (4/V) sum_j V_j rho_j (1 - rho_j): unlike E_mat it has a slope at 0 and 1, so densities reach them.
 
-    max_force : largest force of a patch, in mu_TPE L0^2          limit : weight of the penalty on larger ones
+    max_force : largest force of a patch, in mu_TPE L0^2          smp_, tpe_max_stretch : largest principal stretches
+    limit : weight of the squared relative excess beyond these limits
     """
 
     error_scale: float
@@ -26,6 +27,8 @@ class ObjectiveWeights:
     lam_round: float = 0.0
     lam_smooth: float = 0.0
     max_force: float = np.inf
+    smp_max_stretch: float = np.inf
+    tpe_max_stretch: float = np.inf
     limit: float = 100.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
@@ -88,12 +91,52 @@ def shape_metric(problem: Problem, y: FloatArray, error_scale: float) -> ShapeMe
     """Metric of E_p / error_scale^2 at the final shape y."""
     w = np.repeat(2.0 * problem.area_weights / error_scale**2, 3)
     modes = rigid_modes(y).reshape(-1, 6)
-    return ShapeMetric(w, modes, np.linalg.inv(modes.T @ (w[:, None] * modes)))
+    gram: FloatArray = modes.T @ (w[:, None] * modes)
+    return ShapeMetric(w, modes, np.linalg.inv(gram).astype(np.float64))
 
 
 def force_excess(forces: FloatArray, max_force: float) -> FloatArray:
     """(K,) how far the size of each force is beyond the largest one, relative to it."""
     return np.maximum(np.linalg.norm(forces, axis=1) / max_force - 1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class StretchExcess:
+    """The tets (k,) that the median shape stretches too far, at their most stretched quadrature points.
+
+    values (k,) : relative excess times sqrt(2 limit V_j / V), half of whose squares sum to the penalty
+    rows (k, 3N) : their derivatives with respect to x
+    """
+
+    values: FloatArray
+    rows: csr_array
+
+
+def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray, x: FloatArray) -> StretchExcess:
+    """Principal stretches of x (N, 3) beyond the limits of the materials, mixed by rho (m,)."""
+    body = problem.body
+    nn = body.elements.shape[1]
+    allowed = np.minimum(
+        np.where(rho > 0.0, weights.smp_max_stretch, np.inf), np.where(rho < 1.0, weights.tpe_max_stretch, np.inf)
+    )
+    if np.isinf(allowed).all():
+        return StretchExcess(np.zeros(0), csr_array((0, x.size)))
+    F = np.einsum("mai,mqaj->mqij", x[body.elements], body.dN)
+    # The Frobenius norm bounds the largest stretch from above: most tets need no singular values.
+    near = np.flatnonzero(np.sqrt((F**2).sum(axis=(2, 3))).max(axis=1) > allowed)
+    U, s, Vt = np.linalg.svd(F[near])
+    point = s[:, :, 0].argmax(axis=1)
+    pick = np.arange(len(near)), point
+    over = s[*pick, 0] > allowed[near]
+    tets, pick = near[over], (pick[0][over], point[over])
+    scale = np.sqrt(2 * weights.limit * problem.volume_fractions[tets]) / allowed[tets]
+    values = scale * (s[*pick, 0] - allowed[tets])
+    # d sigma_1 = u_1 . dF v_1
+    along = np.einsum("kaj,kj->ka", body.dN[tets, pick[1]], Vt[*pick, 0])
+    data = scale[:, None, None] * along[:, :, None] * U[*pick, :, 0][:, None, :]
+    columns = (3 * body.elements[tets][:, :, None] + np.arange(3)).reshape(-1)
+    indptr = np.arange(0, len(tets) * 3 * nn + 1, 3 * nn)
+    return StretchExcess(values, csr_array((data.ravel(), columns, indptr), shape=(len(tets), x.size)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +166,10 @@ def density_terms(weights: ObjectiveWeights, v: FloatArray, L: csr_array, rho: F
 
 
 def objective_value(
-    problem: Problem, weights: ObjectiveWeights, terms: DensityTerms, median: Median, final: Final
+    problem: Problem, weights: ObjectiveWeights, terms: DensityTerms, rho: FloatArray, median: Median, final: Final
 ) -> float:
     """The whole objective, each term dimensionless."""
     error = shape_error(problem, final.y).rms / weights.error_scale
-    return error**2 + terms.value + weights.limit * float((force_excess(median.forces, weights.max_force) ** 2).sum())
+    forces = weights.limit * float((force_excess(median.forces, weights.max_force) ** 2).sum())
+    stretches = 0.5 * float((stretch_excess(problem, weights, rho, median.x).values ** 2).sum())
+    return error**2 + terms.value + forces + stretches

@@ -1,6 +1,6 @@
 """Patches: the pads through which the rig holds the part.
 
-The area-weighted mean position of a patch is prescribed; its force is spread with the same weights and carries no moment.
+The area-weighted mean position of a patch is prescribed; its force is spread with the same weights, without a moment.
 """
 
 from dataclasses import dataclass
@@ -70,10 +70,10 @@ def _grow(
     direction = normals[incident].sum(axis=0)
     near = np.flatnonzero((np.linalg.norm(centroids - X[center], axis=1) <= radius) & (normals @ direction > 0))
     inside = np.union1d(incident, near)
-    reached = np.isin(inside, incident)
+    reached = np.asarray(np.isin(inside, incident))
     while True:
         vertices = np.unique(faces[inside[reached]])
-        grown = np.isin(faces[inside], vertices).any(axis=1)
+        grown = np.asarray(np.isin(faces[inside], vertices).any(axis=1))
         if np.array_equal(grown, reached):
             return inside[reached]
         reached = grown
@@ -112,6 +112,6 @@ def spread_centers(problem: Problem, count: int, among: IntArray | None = None) 
 
 
 def pad_vertices(problem: Problem) -> IntArray:
-    """Boundary vertices at which a patch may be centred: those with a face free of the clamp, not clamped themselves."""
+    """Boundary vertices at which a patch may be centred: those with a face free of the clamp."""
     usable = problem.faces[~problem.clamp[problem.faces].any(axis=1)]
     return np.unique(usable)

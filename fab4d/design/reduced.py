@@ -1,4 +1,4 @@
-"""The reduced solver: density and held positions as unknowns, every iterate in exact equilibrium (solver.md section 1)."""
+"""The reduced solver: density and held positions as unknowns, every iterate in equilibrium (solver.md section 1)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -59,7 +59,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     return round_density(start, settings, L, watch)
 
 
-# -- start ---------------------------------------------------------------------------------------------------------------
+# -- start
 
 
 def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibria, Design]:
@@ -108,7 +108,7 @@ def spread_patches(problem: Problem, count: int, radius: float) -> Patches:
     return build_patches(problem, spread_centers(problem, count), radius)
 
 
-# -- phases --------------------------------------------------------------------------------------------------------------
+# -- phases
 
 
 def relax(at: Iterate, settings: ReducedSettings, L: csr_array, watch: Watch) -> Iterate:
@@ -149,7 +149,7 @@ def undecided_fraction(rho: FloatArray) -> float:
     return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
 
 
-# -- refit ---------------------------------------------------------------------------------------------------------------
+# -- refit
 
 
 def change_density(equilibria: Equilibria, design: Design, rho: FloatArray) -> Design:

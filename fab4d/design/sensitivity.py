@@ -44,6 +44,15 @@ def _mixed_matrix(equilibria: Equilibria, rho: FloatArray, median: Median, y: Fl
 
 
 @dataclass(frozen=True, eq=False)
+class Change:
+    """Changes of x (3N,), f (3K,) and y (3N,), or the gradients with respect to them."""
+
+    x: FloatArray
+    f: FloatArray
+    y: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Linearisation:
     """The linear maps of solver.md section 1 about one pair of equilibria.
 
@@ -73,8 +82,8 @@ class Linearisation:
         r[self.free_fixed] = 0.0
         return z[:n].reshape(-1, 3), z[n:].reshape(-1, 3), self.free.solve(r).reshape(-1, 3)
 
-    def forward_rho(self, drho: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """dy (3N,) and df (3K,) of a change drho (m,) at fixed held positions."""
+    def forward_rho(self, drho: FloatArray) -> Change:
+        """What a change drho (m,) at fixed held positions changes."""
         n = self.M.shape[0]
         rhs = np.zeros(n + 3 * self.n_patches)
         rhs[:n] = -(self.R_x @ drho)
@@ -82,11 +91,11 @@ class Linearisation:
         z = self.held.solve(rhs)
         r = -(self.R_y @ drho + self.M @ z[:n])
         r[self.free_fixed] = 0.0
-        return self.free.solve(r), z[n:]
+        return Change(z[:n], z[n:], self.free.solve(r))
 
-    def adjoint_rho(self, gf: FloatArray, gy: FloatArray) -> FloatArray:
-        """Gradient (m,) with respect to rho of a function with gradients gf (3K,), gy (3N,) at fixed held positions."""
-        return self.adjoint(np.zeros_like(gy), gf, gy)[0]
+    def adjoint_rho(self, g: Change) -> FloatArray:
+        """Gradient (m,) with respect to rho at fixed held positions of a function with these gradients."""
+        return self.adjoint(g.x, g.f, g.y)[0]
 
     def adjoint(self, gx: FloatArray, gf: FloatArray, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradients with respect to rho (m,) and held positions (K, 3) of a function with gradients gx, gf, gy.

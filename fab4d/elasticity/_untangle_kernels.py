@@ -1,4 +1,5 @@
 """The inversion-safe energy of `untangle` and its gradient, tet by tet."""
+# mypy: disable-error-code="no-untyped-def"
 
 import math
 

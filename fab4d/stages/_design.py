@@ -24,11 +24,20 @@ from fab4d.stages.monitor import Monitor
 DEFAULT_TOLERANCE = 5e-3
 # Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
 # many places, and repairing these costs more accuracy than a smooth one does from the start.
-LAM_SMP, LAM_SMOOTH = 0.05, 1.0
+LAM_SMP, LAM_SMOOTH = 0.1, 1.0
 
 TRACE_COLUMNS = (
-    "solver", "phase", "wall_s", "tau", "rms_mm", "max_mm", "hausdorff_mm", "smp_fraction", "forces", "ambiguous_fraction",
-)  # fmt: skip
+    "solver",
+    "phase",
+    "wall_s",
+    "tau",
+    "rms_mm",
+    "max_mm",
+    "hausdorff_mm",
+    "smp_fraction",
+    "forces",
+    "ambiguous_fraction",
+)
 
 
 def problem_of(mesh: Mapping[str, np.ndarray], materials: MaterialCard, element: str) -> Problem:
@@ -36,7 +45,9 @@ def problem_of(mesh: Mapping[str, np.ndarray], materials: MaterialCard, element:
     return build_problem(mesh["X"], mesh["X_temp"], mesh["tets"], mesh["clamp"], materials, element)
 
 
-def objective_weights(problem: Problem, goal: Goal, weights: Weights, rig: RigCard) -> ObjectiveWeights:
+def objective_weights(
+    problem: Problem, goal: Goal, weights: Weights, rig: RigCard, materials: MaterialCard
+) -> ObjectiveWeights:
     """Weights of the objective: the scene's, or else those that count an error of the goal's tolerance as 1."""
     tolerance = DEFAULT_TOLERANCE if goal.tolerance is None else goal.tolerance / problem.length
     return ObjectiveWeights(
@@ -45,6 +56,8 @@ def objective_weights(problem: Problem, goal: Goal, weights: Weights, rig: RigCa
         lam_mat=0.0 if weights.lam_mat is None else weights.lam_mat,
         lam_smooth=LAM_SMOOTH if weights.lam_smooth is None else weights.lam_smooth,
         max_force=rig.max_force / problem.force,
+        smp_max_stretch=materials.smp_max_stretch,
+        tpe_max_stretch=materials.tpe_max_stretch,
     )
 
 
@@ -90,7 +103,7 @@ class Trace:
         wall_s = time.perf_counter() - self._start
         n, design, problem = len(self._mesh["X"]), iterate.design, self._problem
         error = shape_error(design.final.y[:n] * problem.length, self._mesh["X_temp"], problem.faces, self._areas)
-        row = {
+        row: dict[str, Any] = {
             "solver": "reduced",
             "phase": iterate.phase,
             "wall_s": wall_s,

@@ -25,6 +25,7 @@ from fab4d.mesh.doctor import (
     rigid_residuals,
 )
 from fab4d.mesh.findings import Finding, finding, named
+from fab4d.mesh.grid import snapped
 from fab4d.mesh.measures import deformation_gradients, tet_volumes
 from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_components
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
@@ -75,8 +76,9 @@ def _steps(materials: MaterialCard) -> dict[str, Step]:
 
 def _arrays(pair: Pair, clamp: BoolArray) -> dict[str, np.ndarray]:
     return {
-        "X": pair.X,
-        "X_temp": pair.X_temp,
+        # On the grid, a scene in metres and the same one in millimetres are the same numbers, and so the same design.
+        "X": snapped(pair.X),
+        "X_temp": snapped(pair.X_temp),
         "tets": pair.tets,
         "clamp": clamp,
         "vertex_map": pair.vertex_map,

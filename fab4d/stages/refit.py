@@ -25,7 +25,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     design = change_density(equilibria, _relaxed_design(equilibria, relaxed), smp)
     trace.add(Iterate("printed", equilibria, design))
     if equilibria.patches.count:
-        weights = objective_weights(problem, profile["goal"], Weights(), profile["rig"])
+        weights = objective_weights(problem, profile["goal"], Weights(), profile["rig"], profile["materials"])
         design = refit(equilibria, design, weights, trace.add)
     design = polished(equilibria, design)
     L0 = problem.length

@@ -55,7 +55,7 @@ def _settings(problem: Problem, profile: Mapping[str, Any]) -> ReducedSettings:
     return ReducedSettings(
         n_points=rig.max_points if goal.max_forces is None else min(goal.max_forces, rig.max_points),
         patch_radius=rig.patch_radius / problem.length,
-        weights=objective_weights(problem, goal, profile["weights"], rig),
+        weights=objective_weights(problem, goal, profile["weights"], rig, profile["materials"]),
         max_smp_fraction=1.0 if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )
 

@@ -69,8 +69,8 @@ def _stretch_reasons(mesh: Mapping[str, np.ndarray], x: FloatArray, smp: FloatAr
         if over.any():
             tet = int(np.argmax(np.where(over, stretch, 0.0)))
             reasons.append(
-                f"{name} is stretched {stretch[tet]:.3g} times in tet {mesh['tet_map'][tet]} ({int(over.sum())} tets in all); "
-                f"the card allows {limit:g}"
+                f"{name} is stretched {stretch[tet]:.3g} times in tet {mesh['tet_map'][tet]} "
+                f"({int(over.sum())} tets in all); the card allows {limit:g}"
             )
     return reasons
 
