@@ -1,5 +1,4 @@
 """The two equilibria of model.md section 2: the held, hot median shape and the free, cold final shape."""
-# mypy: disable-error-code="call-arg"  # numba types a compiled function called with *args as one without any
 
 from dataclasses import dataclass
 from functools import cached_property
