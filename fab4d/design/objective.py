@@ -29,7 +29,7 @@ class ObjectiveWeights:
     max_force: float = np.inf
     smp_max_stretch: float = np.inf
     tpe_max_stretch: float = np.inf
-    limit: float = 100.0
+    limit: float = 10.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
         return replace(self, **changes)
@@ -104,7 +104,7 @@ def force_excess(forces: FloatArray, max_force: float) -> FloatArray:
 class StretchExcess:
     """The tets (k,) that the median shape stretches too far, at their most stretched quadrature points.
 
-    values (k,) : relative excess times sqrt(2 limit V_j / V), half of whose squares sum to the penalty
+    values (k,) : relative excess times sqrt(2 limit), half of whose squares sum to the penalty
     rows (k, 3N) : their derivatives with respect to x
     """
 
@@ -129,7 +129,7 @@ def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray,
     pick = np.arange(len(near)), point
     over = s[*pick, 0] > allowed[near]
     tets, pick = near[over], (pick[0][over], point[over])
-    scale = np.sqrt(2 * weights.limit * problem.volume_fractions[tets]) / allowed[tets]
+    scale = np.sqrt(2 * weights.limit) / allowed[tets]
     values = scale * (s[*pick, 0] - allowed[tets])
     # d sigma_1 = u_1 . dF v_1
     along = np.einsum("kaj,kj->ka", body.dN[tets, pick[1]], Vt[*pick, 0])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -16,6 +17,8 @@ from fab4d.mesh.tetmesh import FloatArray
 
 START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
+FIRST_DAMPING, LARGEST_DAMPING = 0.3, 30.0
+FIRST_LAM_ROUND = 0.02
 
 
 @dataclass(frozen=True)
@@ -31,32 +34,51 @@ class ReducedSettings:
     undecided_fraction: float = 2e-4
 
 
-@dataclass(frozen=True, eq=False)
-class Iterate:
-    """What the solver shows after each accepted step."""
+class Phase(Enum):
+    """What the solver does next."""
 
-    phase: str
+    RELAX = "relax"
+    ROUND = "round"
+    DONE = "done"
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
+
+    phase : of the next step        iteration, slow : steps of this phase, and how many of the last gained little
+    accepted : whether the last step found a better design
+    """
+
     equilibria: Equilibria
     design: Design
+    phase: Phase = Phase.RELAX
+    lam_SMP: float = 0.0
+    lam_round: float = 0.0
+    damping: float = FIRST_DAMPING
+    iteration: int = 0
+    slow: int = 0
+    accepted: bool = True
 
 
-Watch = Callable[[Iterate], None]
+Watch = Callable[[Search], None]
 
 
-def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, start: Iterate | None = None) -> Iterate:
+def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
     """A near 0/1 design that brings the final shape to X_temp with `n_points` held patches.
 
-    start : the last iterate of an interrupted run, to go on from
+    start : the state of an interrupted run, to go on from
     Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
     """
     L = smoothness_matrix(problem)
-    if start is None:
-        equilibria, design = first_design(problem, settings)
-        start = Iterate("start", equilibria, design)
-        watch(start)
-    if start.phase in ("start", "relax"):
-        start = relax(start, settings, L, watch)
-    return round_density(start, settings, L, watch)
+    at = start
+    if at is None:
+        at = Search(*first_design(problem, settings), lam_SMP=settings.weights.lam_SMP)
+        watch(at)
+    while at.phase is not Phase.DONE:
+        at = relax_step(at, settings, L) if at.phase is Phase.RELAX else round_step(at, settings, L)
+        watch(at)
+    return at
 
 
 # -- start
@@ -86,7 +108,7 @@ def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibri
     return equilibria, Design(rho, held_positions(equilibria, median), median, final)
 
 
-def at_rest(problem: Problem) -> Iterate:
+def at_rest(problem: Problem) -> Search:
     """The part of TPE alone, with nothing held: it stays in its permanent shape."""
     equilibria, rho, X = (
         Equilibria(problem, build_patches(problem, np.zeros(0, np.int64), 0.0)),
@@ -94,7 +116,8 @@ def at_rest(problem: Problem) -> Iterate:
         problem.body.X,
     )
     median = equilibria.solve_median(rho, np.zeros((0, 3)), X, np.zeros((0, 3)))
-    return Iterate("rest", equilibria, Design(rho, np.zeros((0, 3)), median, equilibria.solve_final(rho, median, X)))
+    design = Design(rho, np.zeros((0, 3)), median, equilibria.solve_final(rho, median, X))
+    return Search(equilibria, design, Phase.DONE)
 
 
 def _relaxed(equilibria: Equilibria, rho: FloatArray, x: FloatArray) -> Median:
@@ -111,37 +134,38 @@ def spread_patches(problem: Problem, count: int, radius: float) -> Patches:
 # -- phases
 
 
-def relax(at: Iterate, settings: ReducedSettings, L: csr_array, watch: Watch) -> Iterate:
+def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Gauss-Newton on the relaxed density until the objective falls by less than 2 % in two steps running."""
-    design, weights, damping, slow = at.design, settings.weights, 0.3, 0
-    value = evaluate(at.equilibria, weights, L, design)
-    for _ in range(settings.relax_iterations):
-        step = gauss_newton_step(at.equilibria, weights, L, design, damping)
-        if not step.accepted:
-            break
-        slow = slow + 1 if step.value > 0.98 * value else 0
-        design, value, damping = step.design, step.value, step.damping
-        watch(Iterate("relax", at.equilibria, design))
-        if slow == 2:
-            break
-    return Iterate("relax", at.equilibria, design)
+    weights = settings.weights.replace(lam_SMP=at.lam_SMP)
+    value = evaluate(at.equilibria, weights, L, at.design)
+    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
+    slow = at.slow + 1 if step.value > 0.98 * value else 0
+    after = replace(at, design=step.design, damping=step.damping, accepted=step.accepted, slow=slow)
+    if not step.accepted or slow == 2 or at.iteration + 1 == settings.relax_iterations:
+        return replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, iteration=0, slow=0)
+    return replace(after, iteration=at.iteration + 1)
 
 
-def round_density(at: Iterate, settings: ReducedSettings, L: csr_array, watch: Watch) -> Iterate:
+def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Raise lam_round until all but a few densities are 0 or 1, held positions following."""
-    v = at.equilibria.problem.volume_fractions
-    design, weights, damping = at.design, settings.weights.replace(lam_round=0.02), 0.3
-    for _ in range(settings.round_iterations):
-        if v @ design.rho > settings.max_smp_fraction:
-            weights = weights.replace(lam_SMP=1.5 * weights.lam_SMP)
-        step = gauss_newton_step(at.equilibria, weights, L, design, damping)
-        design, damping = step.design, min(step.damping, 30.0)
-        if step.accepted:
-            watch(Iterate("round", at.equilibria, design))
-        if undecided_fraction(design.rho) <= settings.undecided_fraction:
-            break
-        weights = weights.replace(lam_round=1.6 * weights.lam_round)
-    return Iterate("round", at.equilibria, design)
+    too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
+    lam_SMP = 1.5 * at.lam_SMP if too_much else at.lam_SMP
+    weights = settings.weights.replace(lam_SMP=lam_SMP, lam_round=at.lam_round)
+    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
+    finished = (
+        undecided_fraction(step.design.rho) <= settings.undecided_fraction
+        or at.iteration + 1 == settings.round_iterations
+    )
+    return replace(
+        at,
+        design=step.design,
+        phase=Phase.DONE if finished else Phase.ROUND,
+        lam_SMP=lam_SMP,
+        lam_round=1.6 * at.lam_round,
+        damping=min(step.damping, LARGEST_DAMPING),
+        iteration=at.iteration + 1,
+        accepted=step.accepted,
+    )
 
 
 def undecided_fraction(rho: FloatArray) -> float:
@@ -181,14 +205,14 @@ def refit(
     weights = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
     L = smoothness_matrix(problem)
     fixed = np.zeros(problem.n_tets, bool)
-    damping, value = 1e-3, evaluate(equilibria, weights, L, design)
+    damping, value = FIRST_DAMPING, evaluate(equilibria, weights, L, design)
     for _ in range(iterations):
         step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed, tries=12)
         if not step.accepted:
             break
         slow = step.value > (1 - 1e-4) * value
         design, damping, value = step.design, step.damping, step.value
-        watch(Iterate("refit", equilibria, design))
+        watch(Search(equilibria, design, Phase.DONE))
         if slow:
             break
     return design

@@ -11,9 +11,9 @@ from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import Patches, patches_from_faces
 from fab4d.design.problem import Problem, build_problem
-from fab4d.design.reduced import Iterate
+from fab4d.design.reduced import Search
 from fab4d.fabrication.labels import ambiguous_fraction
-from fab4d.io.csvtable import csv_bytes
+from fab4d.io.csvtable import csv_bytes, read_csv
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.distance import shape_error
@@ -24,7 +24,7 @@ from fab4d.stages.monitor import Monitor
 DEFAULT_TOLERANCE = 5e-3
 # Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
 # many places, and repairing these costs more accuracy than a smooth one does from the start.
-LAM_SMP, LAM_SMOOTH = 0.1, 1.0
+LAM_SMP, LAM_SMOOTH = 0.05, 1.0
 
 TRACE_COLUMNS = (
     "solver",
@@ -98,27 +98,38 @@ class Trace:
         self._start = time.perf_counter()
         self.rows: list[dict[str, Any]] = []
 
-    def add(self, iterate: Iterate) -> None:
-        """Measure the true error of the iterate and append its row."""
+    def add(self, phase: str, at: Search) -> None:
+        """Measure the true error of the design and append its row, unless the last step changed nothing."""
+        if not at.accepted:
+            return
         wall_s = time.perf_counter() - self._start
-        n, design, problem = len(self._mesh["X"]), iterate.design, self._problem
+        n, design, problem = len(self._mesh["X"]), at.design, self._problem
         error = shape_error(design.final.y[:n] * problem.length, self._mesh["X_temp"], problem.faces, self._areas)
         row: dict[str, Any] = {
             "solver": "reduced",
-            "phase": iterate.phase,
+            "phase": phase,
             "wall_s": wall_s,
             "tau": wall_s / self._tau_s,
             "rms_mm": error.rms,
             "max_mm": error.max,
             "hausdorff_mm": error.hausdorff,
             "smp_fraction": float(problem.volume_fractions @ design.rho),
-            "forces": iterate.equilibria.patches.count,
+            "forces": at.equilibria.patches.count,
             "ambiguous_fraction": ambiguous_fraction(design.rho),
         }
         self.rows.append(row)
         self._monitor.progress(
-            iterate.phase, rms_mm=error.rms, forces=row["forces"], smp_fraction=row["smp_fraction"], tau=row["tau"]
+            phase, rms_mm=error.rms, forces=row["forces"], smp_fraction=row["smp_fraction"], tau=row["tau"]
         )
+
+    def go_on(self, csv: bytes) -> None:
+        """Take over the rows of an interrupted run; its time counts."""
+        self.rows = [
+            {key: value if key in ("solver", "phase") else float(value) for key, value in row.items()}
+            for row in read_csv(csv, TRACE_COLUMNS, "checkpoint")
+        ]
+        if self.rows:
+            self._start -= self.rows[-1]["wall_s"]
 
     def csv(self) -> bytes:
         """The rows as CSV with a header."""

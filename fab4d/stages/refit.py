@@ -9,7 +9,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design, held_positions
 from fab4d.design.patches import Patches
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Iterate, change_density, polished, refit
+from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.io.scene import Weights
 from fab4d.mesh.measures import face_area_vectors
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
@@ -23,10 +23,10 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
     trace = Trace(problem, mesh, monitor, tau_seconds(equilibria))
     design = change_density(equilibria, _relaxed_design(equilibria, relaxed), smp)
-    trace.add(Iterate("printed", equilibria, design))
+    trace.add("printed", Search(equilibria, design))
     if equilibria.patches.count:
         weights = objective_weights(problem, profile["goal"], Weights(), profile["rig"], profile["materials"])
-        design = refit(equilibria, design, weights, trace.add)
+        design = refit(equilibria, design, weights, lambda at: trace.add("refit", at))
     design = polished(equilibria, design)
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
