@@ -66,6 +66,28 @@ def three_two_one(x: FloatArray) -> IntArray:
     return np.array([3 * a, 3 * a + 1, 3 * a + 2, 3 * b + second, 3 * b + third, 3 * c + last])
 
 
+@dataclass(frozen=True, eq=False)
+class Pinned:
+    """A factor that moves all but the dofs `fixed`; a body that balances itself has no force there either."""
+
+    factor: Factor
+    fixed: IntArray
+
+    @property
+    def n_negative(self) -> int:
+        return self.factor.n_negative
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        b = b.copy()
+        b[self.fixed] = 0.0
+        return self.factor.solve(b)
+
+    def solve_many(self, B: FloatArray) -> FloatArray:
+        B = B.copy()
+        B[self.fixed] = 0.0
+        return self.factor.solve_many(B)
+
+
 class Equilibria:
     """Solves both equilibria of one problem with one set of patches; patterns and symbolic factors are built once."""
 
@@ -96,14 +118,22 @@ class Equilibria:
     def free_analysis(self) -> Analysis:
         return analyse(self.free_pattern.indptr, self.free_pattern.indices)
 
+    def free_mask(self, y: FloatArray) -> DirichletMask:
+        """The six dofs to fix about the shape y (N, 3): those of another shape may leave it free to turn."""
+        fixed = three_two_one(y)
+        key = tuple(fixed.tolist())
+        if key not in self._free_masks:
+            self._free_masks[key] = dirichlet_mask(self.free_pattern, fixed)
+        return self._free_masks[key]
+
     @cached_property
-    def free_mask(self) -> DirichletMask:
-        return dirichlet_mask(self.free_pattern, three_two_one(self.problem.X_temp))
+    def _free_masks(self) -> dict[tuple[int, ...], DirichletMask]:
+        return {}
 
     def with_patches(self, patches: Patches) -> "Equilibria":
         """The same problem with other patches; what does not depend on them is kept."""
         other = Equilibria(self.problem, patches)
-        for name in ("free_pattern", "free_analysis", "free_mask", "block_structure"):
+        for name in ("free_pattern", "free_analysis", "_free_masks", "block_structure"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
@@ -213,13 +243,13 @@ class Equilibria:
     def final_tangent(
         self, rho: FloatArray, median: Median, y: FloatArray, spd: bool = False, unloaded: float = 1.0
     ) -> FloatArray:
-        """Values of d2W_fin/dy2 in the free pattern, six dofs decoupled."""
+        """Values of d2W_fin/dy2 in the free pattern, the dofs of `free_mask` decoupled."""
         pattern = self.free_pattern
         data = np.zeros(pattern.nnz)
         assemble = kernels.tangent_spd if spd else kernels.tangent
         for element_loop in self._final_terms(rho, median, y, unloaded):
             assemble(*element_loop, pattern.rank, pattern.indptr, data)
-        self.free_mask.apply(data, 1.0)
+        self.free_mask(y).apply(data, 1.0)
         return data
 
     def solve_final(
@@ -236,8 +266,7 @@ class Equilibria:
         tolerance : relative to the TPE's pull at the median shape
         unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape.
         """
-        shape, fixed = y.shape, self.free_mask.fixed
-        body, tpe = self.problem.body, self.problem.tpe
+        shape, body, tpe = y.shape, self.problem.body, self.problem.tpe
         pull = np.zeros_like(y)
         kernels.gradient(
             body.elements, body.dN, body.weights, (1 - rho) * tpe.mu, (1 - rho) * tpe.kappa, median.x - body.X, pull
@@ -246,15 +275,14 @@ class Equilibria:
 
         def residual(z: FloatArray) -> Residual:
             g, energy = self.final_gradient(rho, median, z.reshape(shape), unloaded)
-            r = g.ravel()
-            r[fixed] = 0.0
-            return Residual(r, scale, energy)
+            return Residual(g.ravel(), scale, energy)
 
-        def factor(z: FloatArray) -> Factor:
-            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), unloaded=unloaded))
+        def pinned(z: FloatArray, spd: bool) -> Factor:
+            at = z.reshape(shape)
+            tangent = self.free_analysis.factor(self.final_tangent(rho, median, at, spd, unloaded))
+            return Pinned(tangent, self.free_mask(at).fixed)
 
-        def fallback(z: FloatArray) -> Factor:
-            return self.free_analysis.factor(self.final_tangent(rho, median, z.reshape(shape), True, unloaded))
-
-        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0)
+        solution = newton(
+            residual, lambda z: pinned(z, False), y.ravel(), tolerance, max_iterations, lambda z: pinned(z, True), 0
+        )
         return Final(solution.z.reshape(shape), solution)

@@ -139,7 +139,7 @@ def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Fi
         held=held,
         free=free,
         held_fixed=equilibria.held_mask.fixed,
-        free_fixed=equilibria.free_mask.fixed,
+        free_fixed=equilibria.free_mask(final.y).fixed,
         M=M,
         MT=M.T.tobsr(blocksize=(3, 3)),
         R_x=R_x,
