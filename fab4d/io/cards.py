@@ -33,6 +33,10 @@ class PrinterCard:
     layer_height: float
     filament_diameter: float
     source: str
+    nozzle: float = 0.4
+    """Diameter of both nozzles."""
+    purge_per_change: float = 140.0
+    """Purged at a change of tool, mm^3. Source: the default of PrusaSlicer, 70 unloading and 70 loading."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,9 @@ _POLYMER = {
     "density_g_per_cm3": Key(positive, required=True),
     "price_usd_per_kg": Key(non_negative, required=True),
     "max_stretch": Key(_STRETCH, required=True),
+    "max_flow_mm3_per_s": Key(positive),
 }
+_TPE = {"max_service_temperature_K": Key(positive)}
 _PRINTER = {
     "name": Key(text, required=True),
     "source": Key(text, required=True),
@@ -72,6 +78,8 @@ _PRINTER = {
     "line_width_mm": Key(positive, required=True),
     "layer_height_mm": Key(positive, required=True),
     "filament_diameter_mm": Key(positive, required=True),
+    "nozzle_mm": Key(positive),
+    "purge_per_change_mm3": Key(non_negative),
 }
 _RIG = {
     "name": Key(text, required=True),
@@ -87,7 +95,7 @@ def load_material(name: str, scene_folder: Path) -> MaterialCard:
     """The material card `name`. Raises SceneError, or MaterialError when it describes no elastic solid."""
     path = _card_path("materials", name, scene_folder)
     card = read_keys(read_toml(path), _MATERIAL, str(path))
-    tpe = read_keys(card["tpe"], _POLYMER | _MODULI, f"{path} [tpe]")
+    tpe = read_keys(card["tpe"], _POLYMER | _TPE | _MODULI, f"{path} [tpe]")
     smp = read_keys(card["smp"], _POLYMER | {"rubbery": _TABLE, "glassy": _TABLE}, f"{path} [smp]")
     return MaterialCard(
         name=card["name"],
@@ -104,6 +112,9 @@ def load_material(name: str, scene_folder: Path) -> MaterialCard:
         transition_half_width=card["transition_half_width_K"],
         measured=card["measured"],
         source=card["source"],
+        tpe_service_temperature=tpe.get("max_service_temperature_K"),
+        smp_max_flow=smp.get("max_flow_mm3_per_s"),
+        tpe_max_flow=tpe.get("max_flow_mm3_per_s"),
     )
 
 
@@ -144,4 +155,4 @@ def _moduli(table: Mapping[str, Any]) -> Moduli:
 
 def _without_units(table: Mapping[str, Any]) -> dict[str, Any]:
     """The keys without the unit that they end in: volume_mm is the field volume."""
-    return {key.removesuffix("_mm").removesuffix("_N"): value for key, value in table.items()}
+    return {key.removesuffix("_mm").removesuffix("_mm3").removesuffix("_N"): value for key, value in table.items()}

@@ -20,7 +20,10 @@ class Moduli:
 
 @dataclass(frozen=True)
 class MaterialCard:
-    """What model.md calls a preset. Densities in g/cm^3, prices in USD/kg, temperatures in K, stretches as ratios."""
+    """What model.md calls a preset. Densities in g/cm^3, prices in USD/kg, temperatures in K, stretches as ratios.
+
+    The last three are of printing: None where the card does not tell.
+    """
 
     name: str
     tpe: Moduli
@@ -36,6 +39,11 @@ class MaterialCard:
     transition_half_width: float
     measured: bool
     source: str
+    tpe_service_temperature: float | None = None
+    """Up to which TPE keeps its shape in use."""
+    smp_max_flow: float | None = None
+    """Fastest extrusion, mm^3/s."""
+    tpe_max_flow: float | None = None
 
     def __post_init__(self) -> None:
         for phase in ("tpe", "rubbery", "glassy"):
