@@ -24,7 +24,7 @@ from fab4d.stages.monitor import Monitor
 DEFAULT_TOLERANCE = 5e-3
 # Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
 # many places, and repairing these costs more accuracy than a smooth one does from the start.
-LAM_SMP, LAM_SMOOTH = 0.05, 1.0
+LAM_SMP, LAM_SMOOTH = 0.05, 2.5
 
 TRACE_COLUMNS = (
     "solver",
