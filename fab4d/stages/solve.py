@@ -26,7 +26,7 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
-    """Choose the points, relax the density, drive it to 0 and 1; again with other weights if printing costs too much."""
+    """Choose the points, relax the density, drive it to 0 and 1; again with other weights if printing costs a lot."""
     mesh, weights = inputs["mesh"], profile["weights"]
     if weights.lam_force is not None:
         msg = (
