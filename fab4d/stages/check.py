@@ -25,9 +25,10 @@ from fab4d.mesh.doctor import (
     rigid_residuals,
 )
 from fab4d.mesh.findings import Finding, finding, named
-from fab4d.mesh.grid import snapped
+from fab4d.mesh.grid import FINEST_STEP, snapped
 from fab4d.mesh.measures import deformation_gradients, tet_volumes
 from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_components
+from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
 from fab4d.stages.monitor import Monitor
@@ -62,6 +63,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     clamp = resolve_clamp(profile["clamp"], pair, permanent)
     nothing_to_program, found = check_motion(pair, clamp)
     findings += [*_refuse(found), *_refuse(check_boundary(pair, clamp))]
+    if not nothing_to_program:
+        pair, found = _clamp_in_place(pair, clamp)
+        findings += found
     return {"mesh": _arrays(pair, clamp), "check_report": _report(pair, clamp, findings, nothing_to_program)}
 
 
@@ -366,6 +370,19 @@ def _where_it_is(region: ClampRegion, pair: Pair) -> str:
 
 def _box(low: Sequence[float] | FloatArray, high: Sequence[float] | FloatArray) -> str:
     return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
+
+
+def _clamp_in_place(pair: Pair, clamp: BoolArray) -> tuple[Pair, list[Finding]]:
+    """The temporary shape moved rigidly to where its clamp is that of the permanent one, for the rig does not move."""
+    off = float(np.abs(pair.X_temp[clamp] - pair.X[clamp]).max()) if clamp.any() else 0.0
+    if off <= 2 * FINEST_STEP:
+        return pair, []
+    R, t = best_rigid_motion(pair.X_temp[clamp], pair.X[clamp])
+    message = (
+        f"its clamp region lies up to {off:.3g} mm off that of {pair.files[0]}: moved rigidly to where the rig holds it"
+    )
+    moved = replace(pair, X_temp=pair.X_temp @ R.T + t)
+    return moved, [finding("moved", "repaired", pair.files[1], message)]
 
 
 # What is told.

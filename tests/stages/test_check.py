@@ -361,8 +361,24 @@ def test_a_rigid_motion_is_nothing_to_program(offset: float) -> None:
 def test_geo_referenced_coordinates_work() -> None:
     x = X + np.array([4e6, 5e5, 100.0])
     mesh, report = check_points(x, Y, clamp=(ClampRegion(vertices=tuple(range(9))),))
-    assert report["findings"] == []
+    assert set(codes(report)) == {"moved"}
     np.testing.assert_array_equal(mesh["X"], x)
+
+
+def test_a_moved_temporary_shape_comes_back_to_the_clamp() -> None:
+    """The rig holds the clamp where the permanent shape has it: the wanted shape is told relative to it."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    expected, _ = check_points(X, Y)
+    mesh, report = check_points(X, Y @ turn.T + [5, -70, 3])
+    assert codes(report)["moved"]["severity"] == "repaired"
+    np.testing.assert_allclose(mesh["X_temp"], expected["X_temp"], rtol=0, atol=2 * FINEST_STEP)
+    np.testing.assert_allclose(mesh["X_temp"][mesh["clamp"]], X[mesh["clamp"]], rtol=0, atol=2 * FINEST_STEP)
+
+
+def test_without_a_clamp_a_moved_temporary_shape_stays_where_it_is() -> None:
+    mesh, report = check_points(X, Y + 10, clamp=())
+    assert "moved" not in codes(report)
+    np.testing.assert_array_equal(mesh["X_temp"], snapped(Y + 10))
 
 
 def test_a_clamp_that_would_have_to_deform_is_told() -> None:
