@@ -1,0 +1,165 @@
+"""The reduced solver on scenes whose answer is known, because they were made by simulating a design."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from bars import CARD, CLAMPED, bar, held_design, two_patches
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.forward import balance, program
+from fab4d.design.gauss_newton import Design
+from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.problem import Problem, build_problem
+from fab4d.design.reduced import (
+    Phase,
+    ReducedSettings,
+    Search,
+    at_rest,
+    change_density,
+    polished,
+    refit,
+    solve_reduced,
+    undecided_fraction,
+)
+from fab4d.mesh.rigid import best_rigid_motion
+
+WEIGHTS = ObjectiveWeights(error_scale=1e-3, lam_SMP=0.05, lam_smooth=0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A scene and the design that it was made from."""
+
+    problem: Problem
+    equilibria: Equilibria
+    design: Design
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    """SMP in the upper half and at the clamp, pulled at two points; what it becomes is what is wanted."""
+    made = bar(degrees=45.0)
+    equilibria, X, clamp = two_patches(made), made.body.X, made.clamp
+    centroids = X[made.body.elements].mean(axis=1)
+    smp = (centroids[:, 2] > 0.5 * X[:, 2].max()) | (centroids[:, 0] < CLAMPED / made.length)
+    design = held_design(equilibria, smp.astype(np.float64), made.X_temp)
+    R, t = best_rigid_motion(design.final.y[clamp], X[clamp])
+    wanted = design.final.y @ R.T + t
+    problem = build_problem(X * made.length, wanted * made.length, made.body.elements, clamp, CARD)
+    return Truth(problem, Equilibria(problem, equilibria.patches), design)
+
+
+def settings_for(problem: Problem, **changes: object) -> ReducedSettings:
+    settings = ReducedSettings(n_points=4, patch_radius=6.0 / problem.length, weights=WEIGHTS)
+    return replace(settings, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def searched(truth: Truth) -> list[Search]:
+    """Every state that the solver shows on its way."""
+    states: list[Search] = []
+    solve_reduced(truth.problem, settings_for(truth.problem), states.append)
+    return states
+
+
+def rms(problem: Problem, design: Design) -> float:
+    return shape_error(problem, design.final.y).rms
+
+
+def printed(found: Search, weights: ObjectiveWeights = WEIGHTS) -> Design:
+    """The found design with densities rounded and held positions fitted again."""
+    labels = np.round(found.design.rho)
+    design = change_density(found.equilibria, found.design, labels)
+    return polished(found.equilibria, refit(found.equilibria, design, weights, lambda at: None))  # noqa: ARG005
+
+
+def test_a_scene_made_from_a_design_is_solved(truth: Truth, searched: list[Search]) -> None:
+    """Not with the same tets, for many designs have one final shape, but with the same shape."""
+    problem, found = truth.problem, searched[-1]
+    moved = float(np.sqrt(problem.area_weights @ ((problem.X_temp - problem.body.X) ** 2).sum(axis=1)))
+    assert moved > 0.1
+    design = printed(found)
+    assert set(np.unique(design.rho)) == {0.0, 1.0}
+    assert rms(problem, design) < 3e-3
+    assert found.equilibria.patches.count == 4
+
+
+def test_the_solved_scene_is_reached_from_the_permanent_shape(truth: Truth, searched: list[Search]) -> None:
+    found = searched[-1]
+    design = printed(found)
+    done = program(found.equilibria, design.rho, design.median.x, design.median.forces)
+    assert (done.loaded, done.unloaded) == (1.0, 1.0)
+    assert balance(found.equilibria, design.rho, done.median, done.final).final < 1e-9
+    assert shape_error(truth.problem, done.final.y).rms < 3e-3
+
+
+def test_states_are_in_equilibrium_and_within_bounds(searched: list[Search]) -> None:
+    for at in searched:
+        assert at.design.rho.min() >= 0
+        assert at.design.rho.max() <= 1
+        found = balance(at.equilibria, at.design.rho, at.design.median, at.design.final)
+        assert max(found.median, found.final) < 1e-2
+        assert found.min_det_F > 0
+    assert undecided_fraction(searched[-1].design.rho) <= 2e-4
+
+
+def test_phases_follow_each_other(searched: list[Search]) -> None:
+    phases = [at.phase for at in searched]
+    assert phases == sorted(phases, key=list(Phase).index)
+    assert phases[-1] is Phase.DONE
+    relaxed = [rms(at.equilibria.problem, at.design) for at in searched if at.phase is Phase.RELAX]
+    assert relaxed[-1] < 0.5 * relaxed[0]
+
+
+def test_going_on_from_any_state_ends_with_the_same_bits(truth: Truth, searched: list[Search]) -> None:
+    problem = truth.problem
+    for at in (searched[1], searched[len(searched) // 2], searched[-2]):
+        again = solve_reduced(problem, settings_for(problem), lambda state: None, at)  # noqa: ARG005
+        np.testing.assert_array_equal(again.design.rho, searched[-1].design.rho)
+        np.testing.assert_array_equal(again.design.final.y, searched[-1].design.final.y)
+
+
+def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
+    """With the true labels and points there is one answer, and the error goes to rounding."""
+    problem, equilibria, true = truth.problem, truth.equilibria, truth.design
+    rng = np.random.default_rng(0)
+    wrong = true.median.x + 0.02 * rng.standard_normal(3)
+    wrong[problem.clamp] = true.median.x[problem.clamp]
+    start = held_design(equilibria, true.rho, wrong, 1e-9)
+    assert rms(problem, start) > 2e-3
+    found = refit(equilibria, start, WEIGHTS, lambda at: None, 30)  # noqa: ARG005
+    assert rms(problem, found) < 1e-6
+    np.testing.assert_allclose(
+        equilibria.patches.mean(found.median.x), equilibria.patches.mean(true.median.x), atol=1e-5
+    )
+
+
+def test_fewer_smp_is_used_when_the_goal_says_so(truth: Truth, searched: list[Search]) -> None:
+    problem = truth.problem
+    usual = float(problem.volume_fractions @ searched[-1].design.rho)
+    limit = 0.7 * usual
+    few = solve_reduced(problem, settings_for(problem, max_smp_fraction=limit), lambda at: None)  # noqa: ARG005
+    assert float(problem.volume_fractions @ few.design.rho) < 1.1 * limit
+
+
+def test_forces_keep_below_the_largest_one(truth: Truth, searched: list[Search]) -> None:
+    problem = truth.problem
+    largest = 0.5 * float(np.linalg.norm(printed(searched[-1]).median.forces, axis=1).max())
+    weights = WEIGHTS.replace(max_force=largest)
+    weak = solve_reduced(problem, settings_for(problem, weights=weights), lambda at: None)  # noqa: ARG005
+    assert np.linalg.norm(printed(weak, weights).median.forces, axis=1).max() < 1.05 * largest
+
+
+def test_at_rest_nothing_is_held_and_nothing_moves(truth: Truth) -> None:
+    rest = at_rest(truth.problem)
+    assert rest.equilibria.patches.count == 0
+    np.testing.assert_array_equal(rest.design.final.y, truth.problem.body.X)
+
+
+def test_change_density_keeps_the_held_positions(searched: list[Search]) -> None:
+    found = searched[len(searched) // 2]
+    design = change_density(found.equilibria, found.design, np.round(found.design.rho))
+    gap = design.held - found.design.held
+    assert np.abs(gap).max() < 1e-5
+    np.testing.assert_array_equal(design.rho, np.round(found.design.rho))
