@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from shapes.boxes import box
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median, three_two_one
-from fab4d.design.objective import shape_error
+from fab4d.design.objective import rigid_modes, shape_error
 from fab4d.design.patches import Patches, build_patches, patches_from_faces
 from fab4d.design.problem import Problem, build_problem
 from fab4d.elasticity.elements import discretise
@@ -215,6 +215,20 @@ def test_three_two_one_fixes_the_rigid_modes_in_every_orientation(seed: int) -> 
     K = dense(equilibria, equilibria.final_tangent(np.zeros(problem.n_tets), at_rest(equilibria, X), X))
     sizes = np.linalg.eigvalsh(K)
     assert sizes[0] > 1e-6 * sizes[-1]
+
+
+@pytest.mark.parametrize("size", [(40.0, 10.0, 8.0), (40.0, 40.0, 2.0), (40.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
+def test_three_two_one_is_far_from_letting_the_part_turn(size: tuple[float, float, float]) -> None:
+    """The six dofs see every rigid motion, in the worst of many orientations and along the axes."""
+    X = box(size, (4, 2, 2), "six")[0]
+    turns = [np.eye(3), *Rotation.random(300, rng=np.random.default_rng(0)).as_matrix()]
+    worst = np.inf
+    for R in turns:
+        x = (X - X.mean(axis=0)) @ R.T
+        modes = rigid_modes(x).reshape(-1, 6)
+        modes /= np.linalg.norm(modes, axis=0) / np.sqrt(len(x))
+        worst = min(worst, np.linalg.svd(modes[three_two_one(x)], compute_uv=False)[-1])
+    assert worst > 0.04
 
 
 # -- what must not matter
