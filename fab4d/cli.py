@@ -223,3 +223,23 @@ def cards() -> None:
     from fab4d.runner.summary import card_lines
 
     click.echo("\n".join(card_lines()))
+
+
+@main.command(cls=Command)
+@click.argument("folders", metavar="[RUN_FOLDER]...", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--markdown", is_flag=True, help="Print the table in Markdown.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Draw the errors over run time into this PNG file.")
+def bench(folders: tuple[Path, ...], markdown: bool, plot: Path | None) -> None:
+    """Compare finished runs: error against run time.
+
+    Without a RUN_FOLDER, all finished runs in runs/. Errors are relative to the diagonal of the part; tau is the time
+    of one factorisation.
+    """
+    from fab4d.report.bench import bench_lines, bench_plot
+    from fab4d.runner.finished import finished_roots, finished_run
+    from fab4d.runner.workspace import write_files
+
+    runs = [finished_run(folder) for folder in folders or finished_roots(Path("runs"))]
+    if plot:
+        write_files({plot: bench_plot(runs)})
+    click.echo("\n".join(bench_lines(runs, markdown)))

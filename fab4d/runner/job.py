@@ -80,7 +80,7 @@ class Job:
 
         Raises ArtifactError when one is missing or damaged.
         """
-        return Declared(f"stage {stage.name}", {name: self._load(name) for name in stage.reads})
+        return Declared(f"stage {stage.name}", {name: self._load(name, stage) for name in stage.reads})
 
     def profile(self, stage: Stage) -> Declared:
         """The sections of the scene that `stage` depends on."""
@@ -106,11 +106,11 @@ class Job:
             return digest({"versions": versions(), "inputs": input_digests(self.sources)})
         return self.workspace.digest(name)
 
-    def _load(self, name: str) -> Any:
+    def _load(self, name: str, stage: Stage) -> Any:
         if name in SOURCES:
             return self.read_source(self.sources[name])
         if name == RUN:
-            return self._run_record()
+            return self._run_record(stage)
         return self.workspace.load(name) if self.workspace.exists(name) else self._absent(name)
 
     def _absent(self, name: str) -> None:
@@ -121,8 +121,10 @@ class Job:
             msg = f"{self.workspace.path(name)} is missing: stage {writer} writes it, so run from {writer} on"
             raise ArtifactError(msg)
 
-    def _run_record(self) -> dict[str, Any]:
-        manifests = [(name, self.workspace.manifest(name)) for name in self.table.names]
+    def _run_record(self, stage: Stage) -> dict[str, Any]:
+        """What the stages before `stage` took: what it took itself in an earlier run is no part of this one."""
+        before = self.table.names[: self.table.names.index(stage.name)]
+        manifests = [(name, self.workspace.manifest(name)) for name in before]
         finished = [(name, manifest) for name, manifest in manifests if manifest]
         peaks = [manifest["peak_rss_mb"] for _, manifest in finished if manifest["peak_rss_mb"] is not None]
         return {

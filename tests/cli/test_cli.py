@@ -121,7 +121,7 @@ def test_exit_codes_are_distinct() -> None:
     assert len({*codes, errors.Fab4dError.exit_code, USAGE_EXIT_CODE, 0}) == len(codes) + 3
 
 
-@pytest.mark.parametrize("command", [name for name in main.commands if name != "cards"])
+@pytest.mark.parametrize("command", [name for name in main.commands if name not in ("cards", "bench")])
 def test_a_missing_scene_is_named(command: str, tmp_path: Path) -> None:
     result = fab4d(command, tmp_path / "nothing.toml")
     assert result.exit_code == errors.SceneError.exit_code
@@ -251,3 +251,17 @@ def test_cards_lists_every_card_that_comes_with_fab4d() -> None:
     assert result.exit_code == 0
     for card in profiles.rglob("*.toml"):
         assert f"  {card.stem} " in result.stdout
+
+
+def test_bench_compares_the_finished_runs_and_draws_them(scene: Path, stages: dict[str, Any], tmp_path: Path) -> None:
+    assert fab4d("bench").exit_code == errors.ArtifactError.exit_code
+    stages["report_json"] |= {"tau_s": 0.01, "wall_s": 2.0, "peak_rss_mb": 100.0, "element_order": 1}
+    stages["error_vs_time"] = b"tau,rms_mm\n10,0.5\n20,0.25\n"
+    fab4d("run", scene)
+    fab4d("run", scene, "--out", "runs/other")
+    result = fab4d("bench", "--plot", "plots/all.png")
+    assert result.exit_code == 0, result.output
+    assert [line.split()[0] for line in result.stdout.splitlines()] == ["scene", "other", "two-tets"]
+    assert (tmp_path / "plots" / "all.png").read_bytes().startswith(b"\x89PNG")
+    assert fab4d("bench", "runs/other", "--markdown").stdout.splitlines()[-1].startswith("| other | 1 | 8 |")
+    assert fab4d("bench", scene).exit_code == errors.ArtifactError.exit_code
