@@ -32,6 +32,7 @@ STAGE_HELP = {
     "refit": "Fit the held positions to the rounded material.",
     "verify": "Simulate the rounded design anew, from the permanent shape.",
     "bodies": "Write the watertight bodies to print.",
+    "slice": "Slice the bodies and compare.",
     "rig": "Write the sheet to stand at the rig with.",
     "report": "Write the report, the curve of error and the verified state.",
 }
@@ -213,8 +214,101 @@ def _checked(job: "Job") -> "Workspace":
     return job.workspace
 
 
-for _name in stage_table().names[1:]:
-    _stage_command(_name)
+for _stage in stage_table().between("solve", "verify"):
+    _stage_command(_stage.name)
+
+
+@main.command(cls=Command, help=f"{STAGE_HELP['bodies']} Runs the stages that it needs.")
+@click.argument("scene", metavar="SCENE|MESH", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/<name of the scene> if not given.")
+@click.option("--labels", metavar="FIELD", help="Take MESH, a tet mesh, with this cell field: 1 is SMP, 0 is TPE.")
+@click.option("--units", default="mm", show_default=True, help="Of MESH, with --labels: mm, cm, m or in.")
+@click.option("--printer", default="generic-dual-0.4", show_default=True, help="Card, with --labels.")
+@click.option("--materials", default="paper-corrected", show_default=True, help="Card, with --labels.")
+@click.option("--force", is_flag=True, help="Run bodies even where it is current.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def bodies(
+    scene: Path,
+    out: Path | None,
+    labels: str | None,
+    units: str,
+    printer: str,
+    materials: str,
+    force: bool,
+    quiet: bool,
+) -> None:
+    from fab4d.runner.runner import Selection
+    from fab4d.runner.summary import body_lines
+
+    if labels is None:
+        job = _open_job(scene, out)
+        _run(job, Selection(None, "bodies", frozenset({"bodies"} if force else ())), quiet)
+        workspace = job.workspace
+    else:
+        workspace = _labelled_workspace(scene, out, labels, units, printer, materials)
+    click.echo("\n".join(body_lines(workspace.load("bodies_report"))))
+
+
+def _labelled_workspace(
+    mesh: Path, out: Path | None, field: str, units: str, printer: str, materials: str
+) -> "Workspace":
+    """A run folder with the bodies of a labelled mesh."""
+    from fab4d.io.cards import load_material, load_printer
+    from fab4d.io.meshes import read_labelled_mesh
+    from fab4d.runner.summary import file_lines
+    from fab4d.runner.workspace import Workspace
+    from fab4d.stages._labelled import labelled_bodies
+    from fab4d.units import mm_per
+
+    workspace = Workspace(out or Path("runs") / f"{_file_name(mesh.stem)}-bodies", stage_table().artifacts)
+    raw, smp = read_labelled_mesh(mesh, field)
+    cards = load_printer(printer, Path()), load_material(materials, Path())
+    with workspace.locked():
+        workspace.save(labelled_bodies(raw, smp, mm_per(units), mesh.stem, *cards))
+    click.echo("\n".join(file_lines(workspace)))
+    return workspace
+
+
+@main.command("slice", cls=Command, help=f"{STAGE_HELP['slice']} Makes the bodies first if needed.")
+@click.argument("scene", metavar="SCENE|RUN", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/<name of the scene> if not given.")
+@click.option("--slicer", type=click.Choice(["prusa", "cura"]), help="The first that is installed if not given.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def slice_command(scene: Path, out: Path | None, slicer: str | None, quiet: bool) -> None:
+    from fab4d.errors import SliceError
+    from fab4d.io.slicers import find_slicer
+    from fab4d.runner.summary import slice_lines
+    from fab4d.stages.slice import slice_report
+
+    program = find_slicer(slicer)
+    workspace = _with_bodies(scene, out, quiet)
+    with workspace.locked():
+        reads = stage_table().stage("slice").reads
+        inputs = {name: workspace.load(name) if workspace.exists(name) else None for name in reads}
+        report = slice_report(program, inputs)
+        workspace.save({"slice_report": report})
+    click.echo("\n".join(slice_lines(report)))
+    failed = [check for check in report["checks"] if not check["ok"]]
+    if failed:
+        msg = f"{program.program}: {failed[0]['check']} differs by {failed[0]['value']:.2%} of the volume"
+        raise SliceError(msg)
+
+
+def _with_bodies(path: Path, out: Path | None, quiet: bool) -> "Workspace":
+    """The run folder `path`, or that of the scene `path` with its bodies made."""
+    from fab4d.runner.runner import Selection, execute
+    from fab4d.runner.workspace import Workspace
+
+    workspace = Workspace(path, stage_table().artifacts)
+    if workspace.exists("bodies_report"):
+        return workspace
+    job = _open_job(path, out)
+    execute(job, Selection(last="bodies"), _display(quiet))
+    return job.workspace
+
+
+for _stage in stage_table().between("rig", None):
+    _stage_command(_stage.name)
 
 
 @main.command(cls=Command)

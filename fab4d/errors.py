@@ -58,6 +58,12 @@ class MissingToolError(Fab4dError):
     exit_code = 9
 
 
+class SliceError(Fab4dError):
+    """A slicer fails on the bodies, leaves a tool unused, or lays down another volume than theirs."""
+
+    exit_code = 10
+
+
 class InterruptedRunError(Fab4dError):
     """The run was stopped by the user; what was finished is kept."""
 

@@ -221,7 +221,7 @@ def require_bodies(bodies: Bodies) -> None:
         msg = f"SMP and TPE add up to {total!r} mm^3, the part is {bodies.whole.volume!r} mm^3: the labels miss tets"
         raise BodyError(msg)
     if bodies.smp is not None and bodies.tpe is not None:
-        smp, tpe = (_solid(body.vertices, body.faces) for body in (bodies.smp, bodies.tpe))
+        smp, tpe = (as_manifold(body) for body in (bodies.smp, bodies.tpe))
         # By way of the union: manifold3d's intersection and difference of bodies that share faces are not always exact.
         overlap = math.fsum([bodies.smp.volume, bodies.tpe.volume, -(smp + tpe).volume()])
         if abs(overlap) > RELATIVE_VOLUME_ERROR * bodies.whole.volume:
@@ -232,13 +232,18 @@ def require_bodies(bodies: Bodies) -> None:
 def genus(body: Body) -> int:
     """Handles of a solid's surface, all its shells together."""
     # manifold3d counts 1 - (V - E + F) / 2, as if there were one shell.
-    return int(_solid(body.vertices, body.faces).genus()) + shells(body) - 1
+    return int(as_manifold(body).genus()) + shells(body) - 1
 
 
 def shells(body: Body) -> int:
     """Closed surfaces that a body consists of: its pieces and its enclosed pockets."""
     edges = body.faces[:, _FACE_EDGES].reshape(-1, 2)
     return int(component_labels(len(body.vertices), edges).max()) + 1
+
+
+def as_manifold(body: Body) -> manifold3d.Manifold:
+    """The body as a solid of manifold3d."""
+    return _solid(body.vertices, body.faces)
 
 
 def _solid(vertices: FloatArray, faces: IntArray) -> manifold3d.Manifold:

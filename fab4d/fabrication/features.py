@@ -44,6 +44,22 @@ def without_thin_places(
     return result
 
 
+def thin_places(X: FloatArray, tets: IntArray, smp: BoolArray, feature_xy: float, feature_z: float) -> BoolArray:
+    """Tets (m,) of either material that lie in places thinner than the feature, those of a thin part included.
+
+    X : (n, 3), mm        feature_xy, feature_z : mm, z is the build direction
+    """
+    scaled = X / np.array([feature_xy, feature_xy, feature_z])
+    incentres, inradii = _incircles(scaled, tets)
+    narrow = inradii < RADIUS
+    points, neighbours = _sample_points(scaled, tets, incentres), tet_neighbours(tets)
+    thin = np.zeros(len(tets), bool)
+    for label in (True, False):
+        inside = np.asarray(smp) == label
+        thin |= narrow & inside & ~_mostly_covered(scaled, tets, neighbours, points, narrow, inside)
+    return thin
+
+
 def tet_neighbours(tets: IntArray) -> IntArray:
     """The tet (m, 4) across the face opposite to each corner, -1 at the surface."""
     faces = face_table(tets)

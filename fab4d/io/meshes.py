@@ -16,7 +16,7 @@ import meshio
 import numpy as np
 
 from fab4d.errors import MeshError
-from fab4d.mesh.tetmesh import FloatArray, IntArray, frozen
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray, frozen
 
 _CELL_NAMES = ("tetra", "tetra10")
 _VTK_TYPES = MappingProxyType({4: 10, 10: 24})
@@ -51,7 +51,30 @@ def read_mesh(path: Path) -> RawMesh:
     Vertex sets: the format's own point and cell sets, Gmsh's physical names, and integer point fields of 0 and 1.
     Raises MeshError naming the file when it is missing, unreadable, or holds no tets.
     """
+    return _raw_mesh(_read_anything(path), path)
+
+
+def read_labelled_mesh(path: Path, field: str) -> tuple[RawMesh, BoolArray]:
+    """`read_mesh` and which of its tets (m,) the cell field `field` makes SMP: labels 0 and 1, or densities above 0.5.
+
+    Raises MeshError, also when there is no such field or a value of it is outside [0, 1].
+    """
     mesh = _read_anything(path)
+    raw = _raw_mesh(mesh, path)
+    if field not in mesh.cell_data:
+        msg = f'{path}: no cell field "{field}"; it has: {", ".join(sorted(mesh.cell_data)) or "none"}'
+        raise MeshError(msg)
+    blocks = zip(mesh.cells, mesh.cell_data[field], strict=True)
+    values = np.concatenate([np.asarray(v, float) for block, v in blocks if block.type in _CELL_NAMES and len(v)])
+    wild = np.flatnonzero(~((values >= 0) & (values <= 1))) if values.ndim == 1 else np.arange(len(values))
+    if len(wild):
+        found = values[wild[0]].tolist()
+        msg = f'{path}: tet {wild[0]} has {found} in "{field}"; 0 is TPE, 1 is SMP, and a density in between is rounded'
+        raise MeshError(msg)
+    return raw, values > 0.5
+
+
+def _raw_mesh(mesh: meshio.Mesh, path: Path) -> RawMesh:
     blocks = [block.data for block in mesh.cells if block.type in _CELL_NAMES]
     n_tets = sum(len(block) for block in blocks)
     if n_tets == 0:

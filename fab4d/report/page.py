@@ -119,11 +119,18 @@ def _or_dash(value: float | None) -> str:
 
 def _checks(checks: Sequence[Check]) -> str:
     rows = "".join(
-        f'<tr class="{"passed" if c.passed else "failed"}"><td>{escape(c.name)}</td><td>{escape(c.found)}</td>'
-        f"<td>{escape(c.allowed)}</td><td>{'holds' if c.passed else 'fails'}</td></tr>"
+        f'<tr class="{_outcome(c)}"><td>{escape(c.name)}</td><td>{escape(c.found)}</td>'
+        f"<td>{escape(c.allowed)}</td><td>{_outcome(c)}</td></tr>"
         for c in checks
     )
     return f"<table><tr><th>what</th><th>found</th><th>allowed</th><th></th></tr>{rows}</table>"
+
+
+def _outcome(check: Check) -> str:
+    """Also a class of the style sheet."""
+    if check.passed:
+        return "holds"
+    return "warns" if check.warning else "fails"
 
 
 def _forces(points: Sequence[Mapping[str, Any]]) -> str:

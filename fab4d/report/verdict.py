@@ -15,12 +15,13 @@ DEFAULT_TOLERANCE = 5e-3
 
 @dataclass(frozen=True)
 class Check:
-    """What was checked, what was found and allowed (as words), and whether it holds."""
+    """What was checked, what was found and allowed (as words), and whether it holds; a warning rejects no design."""
 
     name: str
     found: str
     allowed: str
     passed: bool
+    warning: bool = False
 
     @property
     def reason(self) -> str:
@@ -52,6 +53,19 @@ def checks_of(figures: Mapping[str, Any], limits: Limits) -> list[Check]:
         _above("smallest det F", figures["min_det_F"], 0.0),
     ]
     return [check for check in found if check is not None]
+
+
+def print_checks_of(report: Mapping[str, Any]) -> list[Check]:
+    """The `checks` about printing that a report holds, as warnings."""
+    return [_print_check(item) for item in report.get("checks", [])]
+
+
+def _print_check(item: Mapping[str, Any]) -> Check:
+    unit = f" {item['unit']}" if item.get("unit") else ""
+    found = item.get("message", "none") if item["value"] is None else plain(item["value"]) + unit
+    place = ", ".join(f"{x:.4g}" for x in item.get("where") or ())
+    allowed = f"{item['sense']} {plain(item['limit'])}{unit}" if "limit" in item else ""
+    return Check(item["check"], f"{found} at ({place}) mm" if place else found, allowed, item["ok"], warning=True)
 
 
 def reasons_of(checks: list[Check], reports: Mapping[str, Mapping[str, Any] | None]) -> list[str]:

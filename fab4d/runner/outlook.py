@@ -25,6 +25,7 @@ STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
     "refit": (2.71, 0.69),
     "verify": (2.54, 0.97),
     "bodies": (0.168, 0.62),
+    "slice": (1.5, 0.7),
     "rig": (0.977, 0.26),
     "report": (2.35, 0.15),
 }

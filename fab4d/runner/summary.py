@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fab4d.io.cards import card_names, load_material, load_printer, load_rig
+from fab4d.report.verdict import print_checks_of
 from fab4d.runner.display import duration
 from fab4d.runner.job import Job
 from fab4d.runner.runner import Selection, plan
@@ -33,7 +34,8 @@ _FILES = {
     "forces_csv": "its forces and positions",
     "smp_stl": "SMP body",
     "tpe_stl": "TPE body",
-    "part_3mf": "both bodies for the slicer",
+    "part_3mf": "both bodies for PrusaSlicer",
+    "part_orca_3mf": "both for OrcaSlicer, Bambu Studio, Cura",
     "design_vtu": "the verified state",
     "error_vs_time": "error against run time",
     "report_json": "all figures",
@@ -47,7 +49,39 @@ def report_lines(report: Mapping[str, Any]) -> list[str]:
         str(report["verdict"]),
         *(f"  - {reason}" for reason in report["reasons"]),
         *(f"  {label:<8} {form(value)}" for label, form, value in figures),
+        *warning_lines(report.get("printing", {})),
     ]
+
+
+def warning_lines(report: Mapping[str, Any]) -> list[str]:
+    """The `checks` of a report about printing that do not hold."""
+    failed = [check for check in print_checks_of(report) if not check.passed]
+    return [f"  warning: {check.reason}" for check in failed]
+
+
+def body_lines(report: Mapping[str, Any]) -> list[str]:
+    """Each body of bodies_report with volume, mass, filament and price, the purge, and the warnings."""
+    lines = [
+        f"  {name.upper()}: tool {body['extruder']}, {body['volume_mm3'] / 1000:.3g} cm^3, {body['mass_g']:.3g} g, "
+        f"{body['filament_m']:.3g} m of filament, {body['cost_usd']:.2f} USD"
+        for name, body in report["bodies"].items()
+    ]
+    purge = report["purge"]
+    lines.append(f"  purge: {purge['tool_changes']} changes of tool, about {purge['volume_mm3'] / 1000:.3g} cm^3")
+    return [*lines, *warning_lines(report)]
+
+
+def slice_lines(report: Mapping[str, Any]) -> list[str]:
+    """What a test slice lays down for each body, its time, and the warnings."""
+    lines = [f"sliced with {report['slicer']}:"]
+    for name, body in report["bodies"].items():
+        lines.append(
+            f"  {name.upper()}: tool {body['extruder']}, {body['sliced_mm3'] / 1000:.4g} cm^3 laid down for a body of "
+            f"{body['volume_mm3'] / 1000:.4g} cm^3, {body['filament_m']:.3g} m of filament"
+        )
+    if report["print_time_s"] is not None:
+        lines.append(f"  print time, without changes of tool: {duration(report['print_time_s'])}")
+    return [*lines, *warning_lines(report)]
 
 
 def unfinished_lines(job: Job, last: str | None) -> list[str]:

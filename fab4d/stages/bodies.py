@@ -1,7 +1,11 @@
 """From labels to the files that a slicer reads, each proven to be a solid before it is written."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
+
+import numpy as np
 
 from fab4d.fabrication.bodies import (
     Bodies,
@@ -12,9 +16,15 @@ from fab4d.fabrication.bodies import (
     require_solid,
     shells,
 )
+from fab4d.fabrication.labels import clusters_of
+from fab4d.fabrication.printability import PrintCheck, PrintLimits, print_checks, tool_changes
+from fab4d.io.cards import PrinterCard
+from fab4d.io.slicers import filament_length
 from fab4d.io.stl import stl_arrays, stl_bytes
-from fab4d.io.threemf import Part, prusa_3mf
+from fab4d.io.threemf import Part, components_3mf, prusa_3mf
 from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+from fab4d.rig.schedule import BATH_MARGIN
 from fab4d.stages.monitor import Monitor
 
 EXTRUDERS = {"smp": 1, "tpe": 2}
@@ -22,23 +32,66 @@ COLOURS = {"smp": "#D9483B", "tpe": "#8FA3B0"}
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
-    """The SMP and TPE bodies as STL files and one 3MF file.
+    """The SMP and TPE bodies as STL files and as two 3MF files, and whether they can be printed.
 
     Raises BodyError when a body is no solid, before and after its STL file is read back, or when the two do not fit.
     """
     mesh, labels = inputs["mesh"], inputs["labels"]
     monitor.progress("bodies", tets=len(mesh["tets"]))
-    bodies = bodies_from_labels(mesh["X"], mesh["tets"], labels["smp"])
+    return print_files(
+        mesh["X"], mesh["tets"], labels["smp"].astype(bool), profile["name"], profile["printer"], profile["materials"]
+    )
+
+
+def print_files(
+    X: FloatArray, tets: IntArray, smp: BoolArray, name: str, printer: PrinterCard, materials: MaterialCard
+) -> dict[str, Any]:
+    """What the stage writes for the tets (m, 4) of X (n, 3), mm, with labels smp (m,). Raises BodyError."""
+    bodies = bodies_from_labels(X, tets, smp)
     require_bodies(bodies)
     files = {body.name: _proven_stl(body) for body in bodies.printed}
     # In a 3MF file the last part wins where two overlap.
     parts = [_part(body) for body in reversed(bodies.printed)]
+    checks = [*print_checks(X, tets, smp, bodies, _print_limits(printer)), *_bath_check(materials)]
+    changes = tool_changes(X, tets, smp, printer.layer_height)
     return {
         "smp_stl": files.get("smp"),
         "tpe_stl": files.get("tpe"),
-        "part_3mf": prusa_3mf(profile["name"], parts),
-        "bodies_report": _report(bodies, int(labels["cluster"].max()), profile["materials"]),
+        "part_3mf": prusa_3mf(name, parts),
+        "part_orca_3mf": components_3mf(name, parts),
+        "bodies_report": _report(bodies, _cluster_count(tets, smp), printer, materials)
+        | {"checks": [_plain(check) for check in checks]}
+        | {"purge": {"tool_changes": changes, "volume_mm3": changes * printer.purge_per_change}}
+        | {"printer": asdict(printer)},
     }
+
+
+def _print_limits(printer: PrinterCard) -> PrintLimits:
+    return PrintLimits(
+        volume=printer.volume,
+        nozzle=printer.nozzle,
+        line_width=printer.line_width,
+        layer_height=printer.layer_height,
+        purge_per_change=printer.purge_per_change,
+    )
+
+
+def _bath_check(materials: MaterialCard) -> list[PrintCheck]:
+    """Whether the TPE bears the bath in which the SMP is programmed; nothing where the card does not tell."""
+    limit = materials.tpe_service_temperature
+    if limit is None:
+        return []
+    bath = materials.transition_temperature + materials.transition_half_width + BATH_MARGIN
+    return [PrintCheck("bath against the service limit of TPE", bath <= limit, bath, "at most", limit, "K")]
+
+
+def _cluster_count(tets: IntArray, smp: BoolArray) -> int:
+    return len(np.unique(clusters_of(tets, smp)[smp]))
+
+
+def _plain(check: PrintCheck) -> dict[str, Any]:
+    """As JSON holds it: no value stands for one that is not finite."""
+    return asdict(check) | {"value": check.value if math.isfinite(check.value) else None}
 
 
 def _proven_stl(body: Body) -> bytes:
@@ -51,8 +104,8 @@ def _part(body: Body) -> Part:
     return Part(body.name.upper(), EXTRUDERS[body.name], COLOURS[body.name], body.vertices, body.faces)
 
 
-def _report(bodies: Bodies, clusters: int, materials: MaterialCard) -> dict[str, Any]:
-    figures = {body.name: _figures(body, materials) for body in bodies.printed}
+def _report(bodies: Bodies, clusters: int, printer: PrinterCard, materials: MaterialCard) -> dict[str, Any]:
+    figures = {body.name: _figures(body, printer, materials) for body in bodies.printed}
     total = sum(figure["volume_mm3"] for figure in figures.values())
     return {
         "bodies": figures,
@@ -67,9 +120,10 @@ def _report(bodies: Bodies, clusters: int, materials: MaterialCard) -> dict[str,
     }
 
 
-def _figures(body: Body, materials: MaterialCard) -> dict[str, Any]:
+def _figures(body: Body, printer: PrinterCard, materials: MaterialCard) -> dict[str, Any]:
     density = {"smp": materials.smp_density, "tpe": materials.tpe_density}[body.name]
     price = {"smp": materials.smp_price, "tpe": materials.tpe_price}[body.name]
+    flow = {"smp": materials.smp_max_flow, "tpe": materials.tpe_max_flow}[body.name]
     mass = body.volume / 1000.0 * density
     return {
         "extruder": EXTRUDERS[body.name],
@@ -77,6 +131,8 @@ def _figures(body: Body, materials: MaterialCard) -> dict[str, Any]:
         "volume_mm3": body.volume,
         "mass_g": mass,
         "cost_usd": mass / 1000.0 * price,
+        "max_flow_mm3_per_s": flow,
+        "filament_m": filament_length(body.volume, printer) / 1000.0,
         "shells": shells(body),
         "genus": genus(body),
     }

@@ -10,7 +10,16 @@ from fab4d.mesh.measures import bounding_box_diagonal
 from fab4d.report import metrics
 from fab4d.report.page import report_page, view_data
 from fab4d.report.trace import joined_trace, trace_csv, trace_plot
-from fab4d.report.verdict import ACCEPTED, DEFAULT_TOLERANCE, REJECTED, Limits, checks_of, left_out_of, reasons_of
+from fab4d.report.verdict import (
+    ACCEPTED,
+    DEFAULT_TOLERANCE,
+    REJECTED,
+    Limits,
+    checks_of,
+    left_out_of,
+    print_checks_of,
+    reasons_of,
+)
 from fab4d.stages.monitor import Monitor
 
 REPORTS = (
@@ -20,6 +29,7 @@ REPORTS = (
     "refit_report",
     "verify_report",
     "bodies_report",
+    "slice_report",
     "rig_report",
 )
 
@@ -34,7 +44,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     checks = checks_of(figures, limits)
     reasons = reasons_of(checks, reports)
     verdict = REJECTED if reasons else ACCEPTED
-    report = {"verdict": verdict, "reasons": reasons} | figures | _origin(inputs, reports)
+    report = {"verdict": verdict, "reasons": reasons} | figures | {"printing": _printing(reports)}
+    report |= _origin(inputs, reports)
     monitor.progress("page", rms_mm=figures["error"]["rms_mm"])
     rows = joined_trace({s: inputs[f"{s}_trace"] for s in ("solve", "refit")}, inputs["run"]["stages"], report["tau_s"])
     plot = trace_plot(rows, limits.tolerance) if rows else None
@@ -44,7 +55,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "error_vs_time": trace_csv(rows) if rows else None,
         "error_plot": plot,
         "design_vtu": _design_vtu(inputs, smp),
-        "report_html": report_page(profile["name"], report, checks, view, plot),
+        "report_html": report_page(
+            profile["name"], report, [*checks, *print_checks_of(report["printing"])], view, plot
+        ),
     }
 
 
@@ -84,6 +97,17 @@ def _figures(
         "element_order": verify.get("element_order"),
         "mass_g": mass,
         "cost_usd": cost,
+    }
+
+
+def _printing(reports: Mapping[str, Any]) -> dict[str, Any]:
+    """Material and purge as planned, the test slice if there was one, and the checks of both."""
+    bodies, sliced = reports["bodies_report"] or {}, reports["slice_report"] or {}
+    return {
+        "filament_m": {name: body.get("filament_m") for name, body in bodies.get("bodies", {}).items()},
+        "purge": bodies.get("purge"),
+        "print_time_s": sliced.get("print_time_s"),
+        "checks": [*bodies.get("checks", []), *sliced.get("checks", [])],
     }
 
 

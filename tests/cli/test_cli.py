@@ -204,9 +204,9 @@ def test_ctrl_c_ends_with_130_and_says_how_to_go_on(scene: Path, stages: dict[st
 
 @pytest.mark.usefixtures("stages")
 def test_a_stage_command_runs_up_to_its_stage_and_tells_what_is_out_of_date(scene: Path) -> None:
-    first = fab4d("bodies", scene)
+    first = fab4d("verify", scene)
     assert first.exit_code == 0
-    assert first.stdout.splitlines()[0] == "done up to bodies"
+    assert first.stdout.splitlines()[0] == "done up to verify"
     assert not Path("runs/two-tets/report.json").exists()
     fab4d("run", scene)
     (scene / "scene.toml").write_text(SCENE + "[goal]\ntolerance = 1\n")

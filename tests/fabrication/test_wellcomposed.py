@@ -1,7 +1,7 @@
 """After the repair every body is a 2-manifold, whatever the labels were."""
 
 from collections import Counter, defaultdict
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -135,9 +135,9 @@ def test_hundred_thousand_tossed_coins_take_ten_seconds(meshes):
     X, tets = meshes["box"]((26, 26, 25))
     smp = np.random.default_rng(0).random(len(tets)) < 0.5
     repaired(*meshes["box"]((2, 2, 2)), np.arange(48) % 2 == 0)
-    start = perf_counter()
+    start = process_time()
     result = repaired(X, tets, smp)
-    assert perf_counter() - start < 10
+    assert process_time() - start < 10
     assert len(pinched_vertices(tets, result)) == 0
 
 

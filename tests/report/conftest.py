@@ -78,6 +78,7 @@ def inputs(bar: ModuleType) -> dict[str, Any]:
             "reasons": [],
         },
         "bodies_report": None,
+        "slice_report": None,
         "rig_report": {"points": 3, "reasons": [], "left_out": []},
         "run": {
             "stages": [

@@ -20,7 +20,7 @@ from fab4d.stages.report import run
 FIELDS = [
     *("verdict", "reasons", "error", "target_displacement_mm", "smp_fraction", "forces", "ambiguous_fraction"),
     *("isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual", "min_det_F", "element_order"),
-    *("mass_g", "cost_usd", "tau_s", "wall_s", "peak_rss_mb", "left_out", "stages", "versions", "inputs"),
+    *("mass_g", "cost_usd", "printing", "tau_s", "wall_s", "peak_rss_mb", "left_out", "stages", "versions", "inputs"),
 ]
 
 
@@ -51,6 +51,19 @@ def test_a_rejected_design_says_why_first_everywhere(inputs, profile):
     assert page.index("did not reach") < page.index("RMS error")
     assert "&lt;SMP&gt; leaks" in page
     assert "<SMP>" not in page
+
+
+def test_printing_warns_without_rejecting(inputs, profile):
+    thin = {"check": "walls", "ok": False, "value": 0.25, "sense": "at most", "limit": 0.001, "unit": "of it"}
+    inputs["bodies_report"] = {"checks": [thin | {"where": [1, 2, 3]}], "bodies": {"smp": {"filament_m": 2.5}}}
+    inputs["slice_report"] = {"checks": [], "print_time_s": 60, "left_out": []}
+    result = run(inputs, profile, SilentMonitor())
+    printing = result["report_json"]["printing"]
+    assert result["report_json"]["verdict"] == "ACCEPTED"
+    assert (printing["filament_m"], printing["print_time_s"]) == ({"smp": 2.5}, 60)
+    assert printing["checks"][0]["check"] == "walls"
+    row = "<td>walls</td><td>0.25 of it at (1, 2, 3) mm</td><td>at most 0.001 of it</td><td>warns</td>"
+    assert row in result["report_html"].decode()
 
 
 def test_default_tolerance_is_a_part_of_the_diagonal(inputs, profile, bar):

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from fab4d.errors import BodyError
-from fab4d.io.cards import load_material
+from fab4d.io.cards import load_material, load_printer
 from fab4d.io.stl import stl_arrays
 from fab4d.stages import bodies
 from fab4d.stages.monitor import SilentMonitor
 
 CARD = load_material("paper-corrected", Path())
+PRINTER = load_printer("generic-dual-0.4", Path())
 
 
 def run(mesh, smp):
-    profile = {"name": "box", "printer": None, "materials": CARD}
+    profile = {"name": "box", "printer": PRINTER, "materials": CARD}
     labels = {"smp": smp, "cluster": smp.astype(int)}
     return bodies.run({"mesh": mesh, "labels": labels}, profile, SilentMonitor())
 

@@ -1,0 +1,59 @@
+"""Bodies of a labelled tet mesh that was made elsewhere: the mesh doctor, the label repair, the print files."""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from fab4d.errors import MeshError
+from fab4d.fabrication.labels import LabelResult, printable_labels
+from fab4d.io.cards import PrinterCard
+from fab4d.io.meshes import RawMesh
+from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.doctor import Pair, check_tets, clean, orient
+from fab4d.mesh.findings import Finding
+from fab4d.mesh.tetmesh import BoolArray
+from fab4d.stages.bodies import print_files
+from fab4d.stages.threshold import feature_size
+
+
+def labelled_bodies(
+    raw: RawMesh, smp: BoolArray, mm: float, name: str, printer: PrinterCard, materials: MaterialCard
+) -> dict[str, Any]:
+    """What stage `bodies` writes, for the tets of `raw` with labels smp (m,), made printable first.
+
+    mm : length of the file's unit
+
+    The report tells what the mesh doctor found and how much volume each step of the repair changed.
+    Raises MeshError for an unusable mesh, BodyError for bodies that are no solids.
+    """
+    pair, findings = _cleaned(raw, mm)
+    result = printable_labels(pair.X, pair.tets, smp[pair.tet_map], *feature_size(printer))
+    files = print_files(pair.X, pair.tets, result.smp, name, printer, materials)
+    files["bodies_report"] |= {
+        "labels": _label_figures(result),
+        "findings": [asdict(found) | {"indices": list(found.indices)} for found in findings],
+    }
+    return files
+
+
+def _cleaned(raw: RawMesh, mm: float) -> tuple[Pair, list[Finding]]:
+    n, m = len(raw.points), len(raw.tets)
+    points = raw.points * mm
+    pair = Pair(points, points, raw.tets, np.arange(n), np.arange(m), (raw.file, raw.file))
+    findings: list[Finding] = []
+    for step in (clean, orient, check_tets):
+        pair, found = step(pair)
+        findings += found
+        errors = [item.message for item in found if item.severity == "error"]
+        if errors:
+            raise MeshError("\n".join(errors))
+    return pair, findings
+
+
+def _label_figures(result: LabelResult) -> dict[str, Any]:
+    return {
+        "changed_fraction": result.changed_fraction,
+        "defects_left": result.defects_left.tolist(),
+        "part_defects": result.part_defects.tolist(),
+    }

@@ -1,0 +1,78 @@
+"""The test slice: real slicers keep the bodies' volumes, wrong ones are told, none is no failure."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fab4d.io.cards import load_material, load_printer
+from fab4d.io.slicers import Slice, Slicer, filament_length, installed_slicers
+from fab4d.stages import bodies
+from fab4d.stages import slice as slicing
+from fab4d.stages.monitor import SilentMonitor
+
+PRINTER = load_printer("generic-dual-0.4", Path())
+PROFILE = {"name": "box", "printer": PRINTER, "materials": load_material("paper-corrected", Path())}
+FAKE = Slicer("prusa", Path("fake"))
+
+
+@pytest.fixture(scope="module")
+def files(mesh):
+    smp = mesh["X"][mesh["tets"]].mean(axis=1)[:, 0] < 10
+    return bodies.run({"mesh": mesh, "labels": {"smp": smp}}, PROFILE, SilentMonitor())
+
+
+def run(files):
+    return slicing.run(files, {}, SilentMonitor())["slice_report"]
+
+
+@pytest.mark.parametrize("kind", ["prusa", "cura"])
+def test_bodies_are_laid_down_by_their_tools(files, kind):
+    for slicer in installed_slicers():
+        if slicer.kind == kind:
+            break
+    else:
+        pytest.skip(f"{kind} is not installed")
+    report = slicing.slice_report(slicer, files)
+    assert [check["ok"] for check in report["checks"]] == [True, True]
+    assert report["bodies"]["smp"]["sliced_mm3"] == pytest.approx(5000, rel=0.03)
+    assert report["bodies"]["tpe"]["sliced_mm3"] == pytest.approx(10000, rel=0.03)
+    assert report["print_time_s"] > 600
+
+
+def lay_down(monkeypatch, *volumes):
+    lengths = tuple(filament_length(volume, PRINTER) for volume in volumes)
+    monkeypatch.setattr(slicing, "find_slicer", lambda: FAKE)
+    monkeypatch.setattr(slicing, "slice_bodies", lambda *_: Slice(lengths, None))
+
+
+@pytest.mark.parametrize(
+    ("volumes", "ok"),
+    [((5000, 10000), [True, True]), ((4840, 10310), [False, False]), ((0, 15000), [False, False])],
+)
+def test_other_volumes_are_told(files, monkeypatch, volumes, ok):
+    lay_down(monkeypatch, *volumes)
+    report = run(files)
+    assert [check["ok"] for check in report["checks"]] == ok
+    assert "reasons" not in report
+
+
+def test_a_tool_without_a_body_must_not_print(mesh, monkeypatch):
+    smp = np.ones(len(mesh["tets"]), bool)
+    files = bodies.run({"mesh": mesh, "labels": {"smp": smp}}, PROFILE, SilentMonitor())
+    lay_down(monkeypatch, 15000, 1)
+    assert [check["ok"] for check in run(files)["checks"]] == [True, False]
+
+
+def test_without_a_slicer_the_slice_is_left_out(files, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    report = run(files)
+    assert report["left_out"][0]["what"] == "test slice"
+    assert report["checks"] == []
+
+
+def test_a_slicer_that_fails_is_told(files, monkeypatch):
+    monkeypatch.setattr(slicing, "find_slicer", lambda: Slicer("prusa", Path("/usr/bin/false")))
+    (check,) = run(files)["checks"]
+    assert not check["ok"]
+    assert "exit code 1" in check["message"]
