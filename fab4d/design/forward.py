@@ -11,6 +11,8 @@ from fab4d.mesh.tetmesh import FloatArray
 
 FIRST_STEP, SMALLEST_STEP = 0.05, 1e-3
 PATH_TOLERANCE, END_TOLERANCE = 1e-7, 1e-12
+# Farther apart, relative to the diagonal, two median shapes are different equilibria.
+SAME_SHAPE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,12 @@ def program(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: Floa
     median, steps, loaded = _load(equilibria, rho, x, forces)
     final, more, unloaded = _unload(equilibria, rho, median)
     return Programming(median, final, steps + more, loaded, unloaded)
+
+
+def same_shape(done: Programming, x: FloatArray) -> bool:
+    """Whether the programming went all the way and ended in the median shape x (N, 3)."""
+    distance = float(np.linalg.norm(done.median.x - x, axis=1).max())
+    return done.loaded == 1.0 and done.unloaded == 1.0 and distance <= SAME_SHAPE
 
 
 def _load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray) -> tuple[Median, int, float]:

@@ -25,6 +25,8 @@ DEFAULT_TOLERANCE = 5e-3
 # Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
 # many places, and repairing these costs more accuracy than a smooth one does from the start.
 LAM_SMP, LAM_SMOOTH = 0.05, 2.5
+# Limits of rig and material are penalties, exceeded a little where the error pulls: they begin below the true limit.
+LIMIT_MARGIN = 0.9
 
 TRACE_COLUMNS = (
     "solver",
@@ -55,9 +57,9 @@ def objective_weights(
         lam_SMP=LAM_SMP if weights.lam_SMP is None else weights.lam_SMP,
         lam_mat=0.0 if weights.lam_mat is None else weights.lam_mat,
         lam_smooth=LAM_SMOOTH if weights.lam_smooth is None else weights.lam_smooth,
-        max_force=rig.max_force / problem.force,
-        smp_max_stretch=materials.smp_max_stretch,
-        tpe_max_stretch=materials.tpe_max_stretch,
+        max_force=LIMIT_MARGIN * rig.max_force / problem.force,
+        smp_max_stretch=LIMIT_MARGIN * materials.smp_max_stretch,
+        tpe_max_stretch=LIMIT_MARGIN * materials.tpe_max_stretch,
     )
 
 

@@ -6,32 +6,66 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
+from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design, held_positions
+from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import Patches
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, change_density, polished, refit
+from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Weights
 from fab4d.mesh.measures import face_area_vectors
+from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
 from fab4d.stages.monitor import Monitor
 
+# How often the held positions are fitted again after the loading has found another equilibrium than the fit.
+MOST_FITS = 3
+
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
-    """Follow the relaxed design to the printed labels and fit the held positions again."""
+    """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, smp = inputs["mesh"], inputs["relaxed"], inputs["labels"]["smp"].astype(np.float64)
     problem = problem_of(mesh, profile["materials"], "linear")
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
     trace = Trace(problem, mesh, monitor, tau_seconds(equilibria))
-    design = change_density(equilibria, _relaxed_design(equilibria, relaxed), smp)
+    design = _printed_design(equilibria, _relaxed_design(equilibria, relaxed), smp)
     trace.add("printed", Search(equilibria, design))
+    fits = 0
     if equilibria.patches.count:
         weights = objective_weights(problem, profile["goal"], Weights(), profile["rig"], profile["materials"])
-        design = refit(equilibria, design, weights, lambda at: trace.add("refit", at))
+        design, fits = _reachable_fit(equilibria, design, weights, trace)
     design = polished(equilibria, design)
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
     reasons = _limit_reasons(problem, equilibria.patches, design, profile)
-    return {"printed": printed, "refit_report": {"reasons": reasons}, "refit_trace": trace.csv()}
+    return {"printed": printed, "refit_report": {"fits": fits, "reasons": reasons}, "refit_trace": trace.csv()}
+
+
+def _printed_design(equilibria: Equilibria, design: Design, smp: FloatArray) -> Design:
+    """The printed labels in equilibrium: near the relaxed design, or else where loading from rest ends."""
+    try:
+        return change_density(equilibria, design, smp)
+    except EquilibriumError:
+        return _programmed(program(equilibria, smp, design.median.x, design.median.forces), smp)
+
+
+def _programmed(done: Programming, smp: FloatArray) -> Design:
+    return Design(smp, np.zeros((0, 3)), done.median, done.final)
+
+
+def _reachable_fit(
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, trace: Trace
+) -> tuple[Design, int]:
+    """Fit the held positions; again from where loading ends while that is elsewhere. Returns the fits made too."""
+    for fit in range(1, MOST_FITS + 1):
+        design = refit(equilibria, design, weights, lambda at: trace.add("refit", at))
+        done = program(equilibria, design.rho, design.median.x, design.median.forces)
+        if same_shape(done, design.median.x) or fit == MOST_FITS:
+            return design, fit
+        design = _programmed(done, design.rho)
+        trace.add("reached", Search(equilibria, design))
+    raise AssertionError  # the loop returns
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:

@@ -48,7 +48,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "tau_s": tau_s,
         "iterations": len(trace.rows),
         "attempts": attempts,
-        "printed_rms_mm": rms * problem.length,
+        "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "left_out": _left_out(profile),
     }
     return _artifacts(problem, found, trace, report)

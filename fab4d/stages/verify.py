@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.forward import Programming, balance, program
+from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.problem import Problem
 from fab4d.mesh.distance import shape_error
@@ -14,9 +14,6 @@ from fab4d.mesh.measures import deformation_gradients, vertex_areas
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import patch_arrays, patches_of, problem_of
 from fab4d.stages.monitor import Monitor
-
-# Farther than this from the designed median shape, relative to the diagonal, the loading has found another equilibrium.
-SAME_SHAPE = 1e-5
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
@@ -49,8 +46,8 @@ def _path_reasons(problem: Problem, done: Programming, x: FloatArray) -> list[st
         return [f"loading from the permanent shape stops after {done.loaded:.0%} of the way: no equilibrium further on"]
     if done.unloaded < 1.0:
         return [f"unloading stops after {done.unloaded:.0%} of the way: no equilibrium further on"]
-    distance = float(np.linalg.norm(done.median.x - x, axis=1).max())
-    if distance > SAME_SHAPE:
+    if not same_shape(done, x):
+        distance = float(np.linalg.norm(done.median.x - x, axis=1).max())
         return [
             f"loading from the permanent shape ends {distance * problem.length:.3g} mm off the designed median shape"
         ]
