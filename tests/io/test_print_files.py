@@ -132,3 +132,20 @@ class TestComponents:
         parts = config.findall("./object/part")
         assert [p.get("id") for p in parts] == ["2", "3"]
         assert [p.find("*[@key='extruder']").get("value") for p in parts] == ["2", "1"]
+
+
+@pytest.mark.parametrize("writer", [prusa_3mf, components_3mf])
+def test_files_are_valid_by_the_strict_reader_of_the_3mf_consortium(writer, tmp_path):
+    """lib3mf in strict mode, which has no wheel for every platform."""
+    lib3mf = pytest.importorskip("lib3mf")
+    path = tmp_path / "part.3mf"
+    path.write_bytes(writer('a "b" <c>', [part("TPE", 2), part("SMP", 1, 2.0)]))
+    model = lib3mf.get_wrapper().CreateModel()
+    reader = model.QueryReader("3mf")
+    reader.SetStrictModeActive(True)
+    reader.ReadFromFile(str(path))
+    assert [reader.GetWarning(k) for k in range(reader.GetWarningCount())] == []
+    triangles, meshes = 0, model.GetMeshObjects()
+    while meshes.MoveNext():
+        triangles += meshes.GetCurrentMeshObject().GetTriangleCount()
+    assert triangles == 8
