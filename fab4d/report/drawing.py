@@ -1,10 +1,13 @@
 """One dimensioned view on paper: picture, extents, mark, numbered arrows."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from PIL import Image
 from reportlab.lib.colors import Color, black, grey, white
 from reportlab.lib.units import mm
 from reportlab.lib.utils import ImageReader
+from reportlab.pdfbase.pdfmetrics import stringWidth
 from reportlab.pdfgen.canvas import Canvas
 
 from fab4d.mesh.tetmesh import FloatArray
@@ -20,7 +23,28 @@ LONGEST_ARROW, SHORTEST_ARROW = 12.0, 4.0
 VIEW_MARGIN = 11.0
 """Room around a view for arrows, numbers and dimensions, mm of paper."""
 DIMENSION_GAP = 4.5
+NUMBER, NUMBER_FONT = 2.4, 6.5
+"""Height of a dimension's number, mm of paper, and its font size."""
 RED, BLUE, CLAMP = Color(0.78, 0.12, 0.10), Color(0.10, 0.25, 0.65), Color(*(CLAMP_COLOUR / 255))
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A level or upright dimension line from a to b, mm of paper, with its number."""
+
+    a: tuple[float, float]
+    b: tuple[float, float]
+    words: str
+    colour: Color
+
+    @property
+    def level(self) -> bool:
+        return self.a[1] == self.b[1]
+
+    @property
+    def width(self) -> float:
+        """Of the number, mm of paper."""
+        return float(stringWidth(self.words, "Helvetica", NUMBER_FONT) / mm + 1)
 
 
 def draw_view(
@@ -40,10 +64,15 @@ def draw_view(
     canvas.saveState()
     canvas.translate((left) * mm, bottom * mm)
     shift = np.array([x0 - left, y0 - bottom])
-    lines = _dimensions(canvas, figure, projection, scale, shift)
+    dimensions = _dimensions(figure, projection, scale, shift)
+    for dimension in dimensions:
+        _dimension_line(canvas, dimension)
     _clamp_box(canvas, plan, projection, scale, shift)
     _mark(canvas, plan, projection, scale, shift)
-    _arrows(canvas, plan, figure, projection, scale, shift, lines, (width, height - 5))
+    occupied = np.concatenate([_occupied(dimension) for dimension in dimensions])
+    _arrows(canvas, plan, figure, projection, scale, shift, occupied, (width, height - 5))
+    for dimension in dimensions:  # last: no arrow may cover a number
+        _dimension_number(canvas, dimension)
     canvas.restoreState()
     _view_title(canvas, projection, left, bottom + height - 3.5, scale)
 
@@ -55,39 +84,50 @@ def _view_title(canvas: Canvas, projection: Projection, x: float, y: float, scal
     canvas.drawString(x * mm, y * mm, f"{frame.name}: {frame.right} right, {frame.up} up, {scale_words(scale)}")
 
 
-def _dimensions(canvas: Canvas, figure: Figure, projection: Projection, scale: float, shift: FloatArray) -> FloatArray:
-    """Extents of the median shape below and left, of the permanent shape above and right; the lines (4, 2, 2)."""
-    lines = []
+def _dimensions(figure: Figure, projection: Projection, scale: float, shift: FloatArray) -> list[Dimension]:
+    """Extents of the median shape below and left, of the permanent shape above and right."""
+    dimensions = []
     for shape, colour, side in ((figure.x, BLUE, -1), (figure.X, grey, 1)):
         flat = projection(shape)[:, :2] * scale + shift
         low, high = flat.min(axis=0), flat.max(axis=0)
         across, up = (high - low) / scale
         edge = projection.size * scale + shift if side > 0 else shift
         level, upright = edge[1] + side * DIMENSION_GAP, edge[0] + side * DIMENSION_GAP
-        lines += [((low[0], level), (high[0], level)), ((upright, low[1]), (upright, high[1]))]
-        _dimension(canvas, *lines[-2], number(across), colour)
-        _dimension(canvas, *lines[-1], number(up), colour)
-    return np.array(lines)
+        dimensions.append(Dimension((low[0], level), (high[0], level), number(across), colour))
+        dimensions.append(Dimension((upright, low[1]), (upright, high[1]), number(up), colour))
+    return dimensions
 
 
-def _dimension(canvas: Canvas, a: tuple[float, float], b: tuple[float, float], words: str, colour: Color) -> None:
-    """A dimension line from a to b, mm of paper, with ticks and its number in a gap."""
-    canvas.setStrokeColor(colour)
+def _occupied(dimension: Dimension) -> FloatArray:
+    """Segments (3, 2, 2) to keep numbered circles off: the line, and the long sides of its number."""
+    a, b = np.array(dimension.a), np.array(dimension.b)
+    axes = np.eye(2) if dimension.level else np.eye(2)[::-1]
+    center, along, across = (a + b) / 2, axes[0] * dimension.width / 2, axes[1] * NUMBER / 2
+    return np.array([[a, b], *([center - along + s * across, center + along + s * across] for s in (-1, 1))])
+
+
+def _dimension_line(canvas: Canvas, dimension: Dimension) -> None:
+    """A line with ticks at both ends."""
+    a, b = dimension.a, dimension.b
+    canvas.setStrokeColor(dimension.colour)
     canvas.setLineWidth(0.4)
     canvas.line(a[0] * mm, a[1] * mm, b[0] * mm, b[1] * mm)
-    level = a[1] == b[1]
+    dx, dy = (0, 1) if dimension.level else (1, 0)
     for x, y in (a, b):
-        dx, dy = (0, 1) if level else (1, 0)
         canvas.line((x - dx) * mm, (y - dy) * mm, (x + dx) * mm, (y + dy) * mm)
+
+
+def _dimension_number(canvas: Canvas, dimension: Dimension) -> None:
+    """The number in a gap in the middle of its line."""
+    a, b = dimension.a, dimension.b
     canvas.saveState()
     canvas.translate((a[0] + b[0]) / 2 * mm, (a[1] + b[1]) / 2 * mm)
-    canvas.rotate(0 if level else 90)
-    wide = canvas.stringWidth(words, "Helvetica", 6.5) / mm + 1
+    canvas.rotate(0 if dimension.level else 90)
     canvas.setFillColor(white)
-    canvas.rect(-wide / 2 * mm, -1.2 * mm, wide * mm, 2.4 * mm, stroke=0, fill=1)
-    canvas.setFillColor(colour)
-    canvas.setFont("Helvetica", 6.5)
-    canvas.drawCentredString(0, -0.8 * mm, words)
+    canvas.rect(-dimension.width / 2 * mm, -NUMBER / 2 * mm, dimension.width * mm, NUMBER * mm, stroke=0, fill=1)
+    canvas.setFillColor(dimension.colour)
+    canvas.setFont("Helvetica", NUMBER_FONT)
+    canvas.drawCentredString(0, -0.8 * mm, dimension.words)
     canvas.restoreState()
 
 

@@ -21,6 +21,8 @@ from fab4d.units import N_PER_KGF
 MARGIN = 12.0
 WIDTH, HEIGHT = A4[0] / mm, A4[1] / mm
 FULL = WIDTH - 2 * MARGIN
+TITLE_WIDTH = 56.0
+"""Of a view, mm of paper."""
 FOOT = 12.0
 """Height kept free at the foot of a page for the boxes to sign, mm."""
 
@@ -82,7 +84,7 @@ def _bench_page(canvas: Canvas, name: str, plan: RigPlan, figure: Figure, reason
         page.y -= 4.6
         page.text(MARGIN, f"NOT POSSIBLE ON THIS RIG: {reason}", 9, bold=True, colour=RED)
     page.y -= 2
-    _views_in_a_row(page, plan, figure, 68.0)
+    _views_in_a_row(page, plan, figure, max(68.0, 100.0 - 4.0 * max(0, plan.points.count + len(reasons) - 8)))
     _point_table(page, plan)
     _clamp_lines(page, plan)
     _schedule_lines(page, plan)
@@ -114,14 +116,29 @@ def _title(page: Page, words: str, remark: str) -> None:
 
 
 def _views_in_a_row(page: Page, plan: RigPlan, figure: Figure, height: float) -> None:
-    width = FULL / 3
     projections = [fitted(frame, figure.X, figure.x) for frame in FRAMES]
-    room = np.array([width - 2 * VIEW_MARGIN, height - 2 * VIEW_MARGIN - 4])
-    scale = min(float(np.min(room / p.size)) for p in projections)
-    page.y -= height
-    for k, projection in enumerate(projections):
-        draw_view(page.canvas, plan, figure, projection, (MARGIN + k * width, page.y, width, height), scale)
+    tallest = max(p.size[1] for p in projections)
+    scale = _row_scale([p.size[0] for p in projections], (height - 2 * VIEW_MARGIN - 4) / tallest)
+    widths = _column_widths([p.size[0] for p in projections], scale)
+    page.y -= scale * tallest + 2 * VIEW_MARGIN + 4
+    left = MARGIN
+    for projection, width in zip(projections, widths, strict=True):
+        room = (left, page.y, width, scale * tallest + 2 * VIEW_MARGIN + 4)
+        draw_view(page.canvas, plan, figure, projection, room, scale)
+        left += width
     _legend(page)
+
+
+def _column_widths(sizes: list[float], scale: float) -> list[float]:
+    """Widths on paper of columns that hold views of `sizes`, both mm, and their titles."""
+    return [max(TITLE_WIDTH, size * scale + 2 * VIEW_MARGIN) for size in sizes]
+
+
+def _row_scale(sizes: list[float], largest: float) -> float:
+    """The largest scale up to `largest` at which views of `sizes` mm fit side by side."""
+    scales = largest * np.linspace(1.0, 0.01, 100)
+    fits = [scale for scale in scales if sum(_column_widths(sizes, scale)) <= FULL]
+    return float(fits[0] if fits else scales[-1])
 
 
 def _views_large(page: Page, plan: RigPlan, figure: Figure, height: float) -> None:

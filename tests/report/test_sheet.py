@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fab4d.mesh.topology import face_table
+from fab4d.report import drawing, sheet
 from fab4d.report.labels import place_labels
 from fab4d.report.views import FRAMES, Figure, fitted, hidden_points, picture
 from fab4d.report.wording import number, printable, scale_words, significant
@@ -150,3 +151,23 @@ def test_forces_beyond_the_rig_are_said_on_the_sheet(bar, rig_run):
     result = rig_run(bar.state_artifact(forces=np.diag([1.0, 1.0, 3e5])))
     assert "point 3 needs 3e+05 N" in result["rig_report"]["reasons"][0]
     assert "NOT POSSIBLE ON THIS RIG" in pdf_text(result["rig_sheet"])
+
+
+@pytest.mark.parametrize("sizes", [[55.0, 55, 155], [1, 1, 1], [152, 152, 132], [4000, 3, 3]])
+def test_views_in_a_row_fit_the_page_at_the_largest_scale_that_does(sizes: list[float]) -> None:
+    scale = sheet._row_scale(sizes, 2.0)
+    assert 0 < scale <= 2.0
+    assert sum(sheet._column_widths(sizes, scale)) <= sheet.FULL
+    assert scale == 2.0 or sum(sheet._column_widths(sizes, scale + 0.02)) > sheet.FULL
+
+
+@pytest.mark.parametrize("end", [(40.0, 0.0), (0.0, 40.0)])
+def test_circles_keep_off_a_dimension_and_its_number(end: tuple[float, float]) -> None:
+    dimension = drawing.Dimension((0.0, 0.0), end, "155.0", drawing.BLUE)
+    line, *sides = drawing._occupied(dimension)
+    np.testing.assert_array_equal(line, [(0.0, 0.0), end])
+    across = 1 if dimension.level else 0
+    for side, level in zip(sides, (-drawing.NUMBER / 2, drawing.NUMBER / 2), strict=True):
+        np.testing.assert_allclose(side[:, across], level)
+        assert np.ptp(side[:, 1 - across]) == pytest.approx(dimension.width)
+        assert side[:, 1 - across].mean() == pytest.approx(20.0)
