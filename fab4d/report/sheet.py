@@ -136,7 +136,7 @@ def _column_widths(sizes: list[float], scale: float) -> list[float]:
 
 def _row_scale(sizes: list[float], largest: float) -> float:
     """The largest scale up to `largest` at which views of `sizes` mm fit side by side."""
-    scales = largest * np.linspace(1.0, 0.01, 100)
+    scales = largest * np.geomspace(1.0, 1e-3, 300)
     fits = [scale for scale in scales if sum(_column_widths(sizes, scale)) <= FULL]
     return float(fits[0] if fits else scales[-1])
 
