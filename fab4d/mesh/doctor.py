@@ -15,12 +15,11 @@ from fab4d.mesh.quality import (
     non_manifold_vertices,
     overlapping_tets,
     side_curvature,
-    vertex_components,
 )
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.rows import repeats, row_ids
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
-from fab4d.mesh.topology import face_table
+from fab4d.mesh.topology import component_labels, face_table
 
 _FLAT_VOLUME = 1e-12  # of the diagonal cubed
 _FLAT_ANGLE, _THIN_ANGLE = 0.05, 5.0  # degrees
@@ -206,7 +205,8 @@ def check_boundary(pair: Pair, clamp: BoolArray) -> list[Finding]:
     faces = face_table(pair.tets).boundary
     return [
         *_non_manifold(pair, faces),
-        *_loose_components(pair, clamp),
+        *_pieces(pair),
+        *_clamp_turns(pair, clamp),
         *_unmerged(pair),
         *_no_interior(pair, faces),
     ]
@@ -231,28 +231,32 @@ def _non_manifold(pair: Pair, faces: IntArray) -> list[Finding]:
     return findings
 
 
-def _loose_components(pair: Pair, clamp: BoolArray) -> list[Finding]:
-    component = vertex_components(len(pair.X), pair.tets)
-    n_components = int(component.max()) + 1
-    held = [k for k in range(n_components) if _holds(pair.X[clamp & (component == k)])]
-    findings = []
-    for k in range(n_components):
-        members = np.flatnonzero(component == k)
-        caught = members[clamp[members]]
-        if len(caught) and k not in held:
-            message = (
-                f"the clamp catches only {named('vertex', pair.vertex_map[caught])} of a piece, on one line: it could "
-                "turn; hold three vertices that are not in line"
-            )
-            findings.append(finding("clamp-turns", "error", pair.files[0], message, pair.vertex_map[caught]))
-        elif n_components > 1 and not len(caught):
-            first = pair.vertex_map[members[0]]
-            message = (
-                f"one of {n_components} separate pieces, that of vertex {first}, has no clamp: hold each by a "
-                "[[rig.clamp]], or merge coincident vertices if it should be one piece"
-            )
-            findings.append(finding("loose-piece", "error", pair.files[0], message, [first]))
-    return findings
+def _pieces(pair: Pair) -> list[Finding]:
+    """A part is printed as one body, and tets that share no face are not printed as one."""
+    piece = component_labels(len(pair.tets), face_table(pair.tets).interior_tets)
+    n_pieces = int(piece.max()) + 1
+    if n_pieces == 1:
+        return []
+    volumes = np.bincount(piece, np.abs(tet_volumes(pair.X, pair.tets)))
+    smallest = int(np.argmin(volumes))
+    vertices = pair.vertex_map[np.unique(pair.tets[piece == smallest])]
+    message = (
+        f"the part is in {n_pieces} pieces that share no face, the smallest ({volumes[smallest]:.3g} mm^3) that of "
+        f"{named('vertex', vertices)}: it must be one body; join or remove pieces, and merge coincident vertices if "
+        "the exporter did not"
+    )
+    return [finding("pieces", "error", pair.files[0], message, vertices)]
+
+
+def _clamp_turns(pair: Pair, clamp: BoolArray) -> list[Finding]:
+    caught = np.flatnonzero(clamp)
+    if len(caught) == 0 or _holds(pair.X[caught]):
+        return []
+    message = (
+        f"the clamp catches only {named('vertex', pair.vertex_map[caught])}, on one line: the part could turn; hold "
+        "three vertices that are not in line"
+    )
+    return [finding("clamp-turns", "error", pair.files[0], message, pair.vertex_map[caught])]
 
 
 def _holds(points: FloatArray) -> bool:

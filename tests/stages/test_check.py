@@ -394,20 +394,12 @@ def two_pieces(gap: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
     return points, np.vstack([TETS, TETS + len(X)])
 
 
-def test_each_piece_needs_a_clamp() -> None:
-    x, tets = two_pieces()
-    with pytest.raises(MeshError, match=rf"one of 2 separate pieces, that of vertex {len(X)}, has no clamp"):
-        check_points(x, bent(x), tets)
-    both = (*LEFT, ClampRegion(box=((61, -1, -1), (63, 99, 99))))
-    _, report = check_points(x, bent(x), tets, clamp=both)
-    assert report["statistics"]["components"] == 2
-
-
-def test_pieces_without_any_clamp_are_refused_each() -> None:
-    x, tets = two_pieces()
-    with pytest.raises(MeshError) as caught:
-        check_points(x, bent(x), tets, clamp=())
-    assert len(str(caught.value).splitlines()) == 2
+@pytest.mark.parametrize("gap", [2.0, 0.0])
+@pytest.mark.parametrize("clamp", [(), (*LEFT, ClampRegion(box=((59, -1, -1), (63, 99, 99))))])
+def test_a_part_in_pieces_is_refused_however_it_is_held(gap: float, clamp: tuple[ClampRegion, ...]) -> None:
+    x, tets = two_pieces(gap)
+    with pytest.raises(MeshError, match=r"in 2 pieces that share no face, the smallest \(3e\+03 mm\^3\)"):
+        check_points(x, bent(x), tets, clamp=clamp)
 
 
 def test_one_piece_needs_no_clamp() -> None:
@@ -417,10 +409,14 @@ def test_one_piece_needs_no_clamp() -> None:
 
 
 def test_unmerged_vertices_are_told() -> None:
-    x, tets = two_pieces(gap=0.0)
-    both = (*LEFT, ClampRegion(box=((59, -1, -1), (61, 99, 99))))
-    _, report = check_points(x, bent(x), tets, clamp=both)
-    assert codes(report)["coincident-vertices"]["count"] == 9
+    """A slit halfway through the part."""
+    slit = np.flatnonzero((X[:, 0] == 15) & (X[:, 1] == 0))
+    copies = np.arange(len(X))
+    copies[slit] = len(X) + np.arange(len(slit))
+    beyond = X[TETS].mean(axis=1)[:, 0] > 15
+    x, tets = np.vstack([X, X[slit]]), np.where(beyond[:, None], copies[TETS], TETS)
+    _, report = check_points(x, bent(x), tets)
+    assert codes(report)["coincident-vertices"]["count"] == len(slit)
 
 
 def test_a_surface_that_touches_itself_is_refused_along_edges_and_told_at_vertices() -> None:
@@ -429,10 +425,12 @@ def test_a_surface_that_touches_itself_is_refused_along_edges_and_told_at_vertic
     along_edge = tets[np.isin(cell, [0, 3])]
     with pytest.raises(MeshError, match=r"touches itself along 1 edges \(vertices \d+ and \d+\)"):
         check_points(x, bent(x), along_edge, clamp=())
-    x, tets = grid(2, 2, 2)
-    at_vertex = tets[np.isin(np.arange(len(tets)) // 6, [0, 7])]
+    x, tets = grid(3, 2, 3)
+    ring = [(0, 0, 1), (0, 0, 0), (1, 0, 0), (2, 0, 0), (2, 0, 1), (2, 0, 2), (2, 1, 2), (1, 1, 2)]
+    at_vertex = tets[np.isin(np.arange(len(tets)) // 6, np.ravel_multi_index(np.transpose(ring), (3, 2, 3)))]
     _, report = check_points(x, bent(x), at_vertex, clamp=())
-    assert codes(report)["non-manifold-vertex"]["indices"] == [13]
+    (vertex,) = codes(report)["non-manifold-vertex"]["indices"]
+    assert x[vertex].tolist() == [5, 5, 10]
 
 
 def test_a_part_one_tet_thick_is_told() -> None:
@@ -473,7 +471,7 @@ def test_a_box_whose_face_misses_vertices_by_rounding_catches_them() -> None:
 
 
 def test_a_clamp_on_one_line_is_refused() -> None:
-    with pytest.raises(MeshError, match=r"only vertices 0, 1, 2 of a piece, on one line"):
+    with pytest.raises(MeshError, match=r"only vertices 0, 1, 2, on one line"):
         check_points(X, Y, clamp=(ClampRegion(vertices=(0, 1, 2)),))
 
 
