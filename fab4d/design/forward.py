@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median
+from fab4d.design.problem import at_nodes
 from fab4d.elasticity import _kernels as kernels
 from fab4d.mesh.interpolation import shape_path
 from fab4d.mesh.tetmesh import FloatArray
 
 FIRST_STEP, SMALLEST_STEP = 0.05, 1e-3
-PATH_TOLERANCE, END_TOLERANCE = 1e-7, 1e-12
+PATH_TOLERANCE, END_TOLERANCE = 1e-7, 1e-11
 # Farther apart, relative to the diagonal, two median shapes are different equilibria.
 SAME_SHAPE = 1e-5
 
@@ -48,10 +49,10 @@ def _load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatA
     corners = problem.body.elements[:, :4]
     n = int(corners.max()) + 1
     path = shape_path(problem.body.X[:n], x[:n], corners, problem.clamp[:n])
-    correction = patches.mean(x) + RIG_COMPLIANCE * forces - _corner_mean(equilibria, path.at(1.0))
+    correction = patches.mean(x) + RIG_COMPLIANCE * forces - patches.mean(at_nodes(problem, path.at(1.0)))
 
     def held(t: float) -> FloatArray:
-        return _corner_mean(equilibria, path.at(t)) + t * correction
+        return patches.mean(at_nodes(problem, path.at(t))) + t * correction
 
     none = np.zeros((patches.count, 3))
     median = equilibria.solve_median(rho, patches.mean(problem.body.X), problem.body.X, none)
@@ -64,18 +65,6 @@ def _load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatA
         else:
             step /= 2
     return equilibria.solve_median(rho, held(done), median.x, median.forces, END_TOLERANCE, 10), steps, done
-
-
-def _corner_mean(equilibria: Equilibria, x: FloatArray) -> FloatArray:
-    """Patch means of a shape given at the corners; mid-edge nodes are taken half-way."""
-    problem = equilibria.problem
-    full = problem.body.X.copy()
-    full[: len(x)] = x
-    if len(x) < len(full):
-        elements = problem.body.elements
-        for k, (i, j) in enumerate(((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)), start=4):
-            full[elements[:, k]] = 0.5 * (full[elements[:, i]] + full[elements[:, j]])
-    return equilibria.patches.mean(full)
 
 
 def _unload(equilibria: Equilibria, rho: FloatArray, median: Median) -> tuple[Final, int, float]:

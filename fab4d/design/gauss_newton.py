@@ -158,7 +158,7 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
     return Model(
         lin=lin,
         metric=metric,
-        gradient_rho=g_rho + terms.gradient,
+        gradient_rho=g_rho + terms.gradient + stretch.density_gradient(problem.n_tets),
         gradient_c=g_c.ravel(),
         dx_dc=dx_dc,
         df_dc=df_dc,

@@ -8,7 +8,7 @@ from scipy.sparse import csr_array, diags_array
 from fab4d.design.equilibria import Final, Median
 from fab4d.design.problem import Problem
 from fab4d.mesh.rigid import best_rigid_motion
-from fab4d.mesh.tetmesh import FloatArray
+from fab4d.mesh.tetmesh import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ObjectiveWeights:
     max_force: float = np.inf
     smp_max_stretch: float = np.inf
     tpe_max_stretch: float = np.inf
-    limit: float = 10.0
+    limit: float = 100.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
         return replace(self, **changes)
@@ -105,22 +105,28 @@ class StretchExcess:
     """The tets (k,) that the median shape stretches too far, at their most stretched quadrature points.
 
     values (k,) : relative excess times sqrt(2 limit), half of whose squares sum to the penalty
-    rows (k, 3N) : their derivatives with respect to x
+    rows (k, 3N), by_density (k,) : their derivatives with respect to x and to the tet's own density
     """
 
+    tets: IntArray
     values: FloatArray
     rows: csr_array
+    by_density: FloatArray
+
+    def density_gradient(self, n_tets: int) -> FloatArray:
+        """(m,) gradient of the penalty with respect to the density."""
+        gradient = np.zeros(n_tets)
+        gradient[self.tets] = self.values * self.by_density
+        return gradient
 
 
 def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray, x: FloatArray) -> StretchExcess:
-    """Principal stretches of x (N, 3) beyond the limits of the materials, mixed by rho (m,)."""
+    """Principal stretches of x (N, 3) beyond the limit, which is mixed of the materials' by rho (m,)."""
     body = problem.body
     nn = body.elements.shape[1]
-    allowed = np.minimum(
-        np.where(rho > 0.0, weights.smp_max_stretch, np.inf), np.where(rho < 1.0, weights.tpe_max_stretch, np.inf)
-    )
-    if np.isinf(allowed).all():
-        return StretchExcess(np.zeros(0), csr_array((0, x.size)))
+    if np.isinf(weights.smp_max_stretch) or np.isinf(weights.tpe_max_stretch):
+        return StretchExcess(np.zeros(0, np.int64), np.zeros(0), csr_array((0, x.size)), np.zeros(0))
+    allowed = rho * weights.smp_max_stretch + (1 - rho) * weights.tpe_max_stretch
     F = np.einsum("mai,mqaj->mqij", x[body.elements], body.dN)
     # The Frobenius norm bounds the largest stretch from above: most tets need no singular values.
     near = np.flatnonzero(np.sqrt((F**2).sum(axis=(2, 3))).max(axis=1) > allowed)
@@ -136,7 +142,9 @@ def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray,
     data = scale[:, None, None] * along[:, :, None] * U[*pick, :, 0][:, None, :]
     columns = (3 * body.elements[tets][:, :, None] + np.arange(3)).reshape(-1)
     indptr = np.arange(0, len(tets) * 3 * nn + 1, 3 * nn)
-    return StretchExcess(values, csr_array((data.ravel(), columns, indptr), shape=(len(tets), x.size)))
+    rows = csr_array((data.ravel(), columns, indptr), shape=(len(tets), x.size))
+    by_density = -scale * s[*pick, 0] / allowed[tets] * (weights.smp_max_stretch - weights.tpe_max_stretch)
+    return StretchExcess(tets, values, rows, by_density)
 
 
 @dataclass(frozen=True, eq=False)

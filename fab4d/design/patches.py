@@ -50,14 +50,23 @@ def build_patches(problem: Problem, centers: IntArray, radius: float) -> Patches
     """Patches of the given dimensionless radius around boundary vertices outside the clamp.
 
     A patch holds the boundary faces at its centre and those whose centroid is within the radius, connected to it and
-    not facing away from it. Faces with a clamped corner are left out.
+    not facing away from it. Faces with a clamped corner are left out, and but for those at its centre, faces that touch
+    another patch.
     """
     usable = np.flatnonzero(~problem.clamp[problem.faces].any(axis=1))
     faces = problem.faces[usable]
     X = problem.body.X
     normals = face_area_vectors(X, faces)
     centroids = X[faces].mean(axis=1)
-    chosen = [_grow(X, faces, normals, centroids, center, radius) for center in centers]
+    incident = [(faces == center).any(axis=1) for center in centers]
+    owner = np.full(len(X), -1)
+    for k, at_center in reversed(list(enumerate(incident))):
+        owner[faces[at_center]] = k
+    chosen = []
+    for k, center in enumerate(centers):
+        mine = np.flatnonzero(incident[k] | np.isin(owner[faces], (-1, k)).all(axis=1))
+        chosen.append(mine[_grow(X, faces[mine], normals[mine], centroids[mine], center, radius)])
+        owner[faces[chosen[-1]]] = k
     offsets = np.r_[0, np.cumsum([len(c) for c in chosen])].astype(np.int64)
     all_faces = faces[np.concatenate(chosen)] if len(chosen) else np.zeros((0, 3), np.int64)
     return patches_from_faces(problem, np.asarray(centers, np.int64), all_faces, offsets)

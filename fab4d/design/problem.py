@@ -90,6 +90,14 @@ def build_problem(
     )
 
 
+def at_nodes(problem: Problem, x: FloatArray) -> FloatArray:
+    """Vertex positions (n, 3) at all nodes (N, 3) of the problem: mid-edge nodes half-way."""
+    if problem.body.order == 1:
+        return x
+    edges, _ = unique_edges(problem.body.elements[:, :4])
+    return with_midpoints(x, edges)
+
+
 def face_nodes(problem: Problem, faces: IntArray) -> IntArray:
     """Nodes (f, 3) or (f, 6: corners, then mid-edge nodes) of boundary faces given by their corners (f, 3)."""
     if problem.body.order == 1:

@@ -19,6 +19,8 @@ START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
 FIRST_DAMPING, LARGEST_DAMPING = 0.3, 30.0
 FIRST_LAM_ROUND = 0.02
+# Held at fewer points, a part without a clamp can turn about the line through them.
+FEWEST_FREE_POINTS = 3
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,11 @@ def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibri
 
     When that fails, four times as many points are held first, then those are let go.
     """
-    rho, x = np.full(problem.n_tets, START_DENSITY), problem.X_temp
+    if not problem.clamp.any() and settings.n_points < FEWEST_FREE_POINTS:
+        msg = f"a part without a clamp needs {FEWEST_FREE_POINTS} points at least: give one or raise [goal] max_forces"
+        raise EquilibriumError(msg)
+    rho = np.full(problem.n_tets, START_DENSITY)
+    x = np.where(problem.clamp[:, None], problem.body.X, problem.X_temp)
     equilibria = Equilibria(problem, spread_patches(problem, settings.n_points, settings.patch_radius))
     median = _relaxed(equilibria, rho, x)
     if not median.solution.converged:
@@ -218,7 +224,7 @@ def refit(
     return design
 
 
-def polished(equilibria: Equilibria, design: Design, tolerance: float = 1e-12) -> Design:
+def polished(equilibria: Equilibria, design: Design, tolerance: float = 1e-11) -> Design:
     """The same design with both equilibria solved as far as rounding allows."""
     median: Median = equilibria.solve_median(
         design.rho, held_positions(equilibria, design.median), design.median.x, design.median.forces, tolerance

@@ -5,15 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.forward import Programming, program, same_shape
-from fab4d.design.gauss_newton import Design, held_positions
+from fab4d.design.gauss_newton import Design, equilibrate
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import Patches
-from fab4d.design.problem import Problem
+from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
-from fab4d.io.scene import Weights
 from fab4d.mesh.measures import face_area_vectors
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
@@ -21,25 +20,39 @@ from fab4d.stages.monitor import Monitor
 
 # How often the held positions are fitted again after the loading has found another equilibrium than the fit.
 MOST_FITS = 3
+LEFT_OUT = {
+    "linear": [
+        {
+            "what": "quadratic elements",
+            "why": 'the last fit uses linear ones ([solver] element = "quadratic" changes that)',
+        }
+    ],
+    "quadratic": [],
+}
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, smp = inputs["mesh"], inputs["relaxed"], inputs["labels"]["smp"].astype(np.float64)
-    problem = problem_of(mesh, profile["materials"], "linear")
+    element = profile["solver"].element
+    problem = problem_of(mesh, profile["materials"], element)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
-    trace = Trace(problem, mesh, monitor, tau_seconds(equilibria))
+    trace = Trace(problem, mesh, monitor, tau_seconds(problem))
     design = _printed_design(equilibria, _relaxed_design(equilibria, relaxed), smp)
     trace.add("printed", Search(equilibria, design))
     fits = 0
     if equilibria.patches.count:
-        weights = objective_weights(problem, profile["goal"], Weights(), profile["rig"], profile["materials"])
+        weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
         design, fits = _reachable_fit(equilibria, design, weights, trace)
     design = polished(equilibria, design)
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
     reasons = _limit_reasons(problem, equilibria.patches, design, profile)
-    return {"printed": printed, "refit_report": {"fits": fits, "reasons": reasons}, "refit_trace": trace.csv()}
+    return {
+        "printed": printed,
+        "refit_report": {"fits": fits, "reasons": reasons, "left_out": LEFT_OUT[element]},
+        "refit_trace": trace.csv(),
+    }
 
 
 def _printed_design(equilibria: Equilibria, design: Design, smp: FloatArray) -> Design:
@@ -69,13 +82,19 @@ def _reachable_fit(
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:
+    """The relaxed design, found with linear tets, in equilibrium for the elements of the fit.
+
+    Raises EquilibriumError where these find no equilibrium near it.
+    """
     problem, rho = equilibria.problem, relaxed["rho"]
-    x, y = relaxed["x"] / problem.length, relaxed["y"] / problem.length
+    x, y = (at_nodes(problem, relaxed[name] / problem.length) for name in ("x", "y"))
     forces = relaxed["patch_force"] / problem.force
-    held = relaxed["patch_held"] / problem.length
-    median = equilibria.solve_median(rho, held, x, forces)
-    median = equilibria.solve_median(rho, held_positions(equilibria, median), median.x, median.forces)
-    return Design(rho, held, median, equilibria.solve_final(rho, median, y))
+    held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
+    design = equilibrate(equilibria, rho, held, x, forces, y, max_iterations=100)
+    if design is None:
+        msg = "the relaxed design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
+        raise EquilibriumError(msg)
+    return design
 
 
 def _limit_reasons(problem: Problem, patches: Patches, design: Design, profile: Mapping[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from fab4d.stages.threshold import labels_for
 CHECKPOINT, BEST = "iterate", "best"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
 USUAL_SMP_FRACTION = 0.5
+LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors this mesh in memory"}]
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
@@ -33,11 +34,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
             "weights.lam_force: the reduced solver takes a number of points ([goal] max_forces), not a price of forces"
         )
         raise SceneError(msg)
-    problem = problem_of(mesh, profile["materials"], profile["solver"].element)
-    rest = at_rest(problem)
-    tau_s = tau_seconds(rest.equilibria)
+    problem = problem_of(mesh, profile["materials"], "linear")
+    tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     if inputs["check_report"]["nothing_to_program"]:
+        rest = at_rest(problem)
         trace.add("rest", rest)
         why = [
             {"what": "design, forces and rig sheet", "why": "the temporary shape is the permanent one, moved rigidly"}
@@ -49,7 +50,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "iterations": len(trace.rows),
         "attempts": attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
-        "left_out": _left_out(profile),
+        "left_out": LEFT_OUT,
     }
     return _artifacts(problem, found, trace, report)
 
@@ -116,18 +117,9 @@ def _settings(problem: Problem, profile: Mapping[str, Any], attempt: int) -> Red
     )
 
 
-def _left_out(profile: Mapping[str, Any]) -> list[dict[str, str]]:
-    left_out = [{"what": "iterative linear solver", "why": "the direct one factors this mesh in memory"}]
-    if profile["solver"].element == "linear":
-        left_out.append(
-            {"what": "quadratic elements", "why": 'the scene asks for linear ones ([solver] element = "linear")'}
-        )
-    return left_out
-
-
 def _artifacts(problem: Problem, found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:
-    design, n = found.design, len(np.unique(problem.body.elements[:, :4]))
-    relaxed = {"rho": design.rho, "x": design.median.x[:n] * problem.length, "y": design.final.y[:n] * problem.length}
+    design = found.design
+    relaxed = {"rho": design.rho, "x": design.median.x * problem.length, "y": design.final.y * problem.length}
     return {
         "relaxed": relaxed | patch_arrays(problem, found.equilibria.patches, design),
         "solve_report": report,

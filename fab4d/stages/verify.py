@@ -20,15 +20,17 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     """Load step by step from the permanent shape, cool, unload; measure what comes out."""
     mesh, printed, materials = inputs["mesh"], inputs["printed"], profile["materials"]
     smp = inputs["labels"]["smp"].astype(np.float64)
-    problem = problem_of(mesh, materials, "linear")
+    problem = problem_of(mesh, materials, profile["solver"].element)
     equilibria = Equilibria(problem, patches_of(problem, printed))
     monitor.progress("load")
     x = printed["x"] / problem.length
     done = program(equilibria, smp, x, printed["patch_force"] / problem.force)
     residual = balance(equilibria, smp, done.median, done.final)
     y = done.final.y * problem.length
-    error = shape_error(y, mesh["X_temp"], problem.faces, vertex_areas(mesh["X"], problem.faces))
-    reasons = _path_reasons(problem, done, x) + _stretch_reasons(mesh, done.median.x * problem.length, smp, materials)
+    n = len(mesh["X"])
+    error = shape_error(y[:n], mesh["X_temp"], problem.faces, vertex_areas(mesh["X"], problem.faces))
+    stretched = _stretch_reasons(mesh, done.median.x[:n] * problem.length, smp, materials)
+    reasons = _path_reasons(problem, done, x) + stretched
     report = {
         "element_order": problem.body.order,
         "equilibrium_residual": {"median": residual.median, "final": residual.final},
