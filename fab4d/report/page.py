@@ -105,7 +105,7 @@ def _figures(report: Mapping[str, Any]) -> str:
         "fixity": _or_dash(report["fixity"]),
         "undesired deformation": _or_dash(report["undesired_deformation"]),
         "smallest det F": _or_dash(report["min_det_F"]),
-        "residual, median / final": f"{_or_dash(residual['median'])} / {_or_dash(residual['final'])}",
+        "residual, median / final": f"{_power(residual['median'])} / {_power(residual['final'])}",
         "mass": f"{plain(report['mass_g'])} g",
         "material": f"{plain(report['cost_usd'])} USD",
         "run time": f"{plain(report['wall_s'])} s",
@@ -115,6 +115,11 @@ def _figures(report: Mapping[str, Any]) -> str:
 
 def _or_dash(value: float | None) -> str:
     return "–" if value is None else plain(value)
+
+
+def _power(value: float | None) -> str:
+    """A size so small that only its power of ten matters."""
+    return "–" if value is None else f"{value:.0e}"
 
 
 def _checks(checks: Sequence[Check]) -> str:

@@ -97,7 +97,7 @@
 
   const camera = new THREE.PerspectiveCamera(35, 1, size / 100, size * 20);
   camera.up.set(0, 0, 1);
-  camera.position.copy(center).add(new THREE.Vector3(0.7, -1.25, 0.6).multiplyScalar(size));
+  camera.position.copy(center).add(new THREE.Vector3(0.57, -1.02, 0.49).multiplyScalar(size));
   const sun = new THREE.DirectionalLight(0xffffff, 1.9);
   sun.position.set(0.4, 0.6, 1);
   camera.add(sun);
