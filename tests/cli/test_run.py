@@ -354,7 +354,9 @@ def test_the_rig_sheet_is_a_pdf_and_the_page_stands_alone(strip: Path) -> None:
 
 def killed_at(line: str, out: Path, with_signal: signal.Signals = signal.SIGKILL) -> int:
     """Start a run, send it a signal as soon as it shows a line that begins with `line`; its exit code."""
-    process = subprocess.Popen(command("run", STRIP, "--out", out), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command("run", STRIP, "--out", out), stderr=subprocess.PIPE, text=True, preexec_fn=_heed_interrupts
+    )
     assert process.stderr is not None
     with process, process.stderr:
         for shown in process.stderr:
@@ -364,6 +366,11 @@ def killed_at(line: str, out: Path, with_signal: signal.Signals = signal.SIGKILL
                 return process.wait()
     msg = f"the run never showed {line!r}"
     raise AssertionError(msg)
+
+
+def _heed_interrupts() -> None:
+    """Shells start what they put in the background deaf to SIGINT, and processes inherit that: so would the run."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
