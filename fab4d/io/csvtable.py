@@ -8,6 +8,20 @@ from fab4d.errors import ArtifactError
 
 Cell = str | int | float
 
+# The columns of error-vs-time.csv and of the traces that it is joined from.
+TRACE_COLUMNS = (
+    "solver",
+    "phase",
+    "wall_s",
+    "tau",
+    "rms_mm",
+    "max_mm",
+    "hausdorff_mm",
+    "smp_fraction",
+    "forces",
+    "ambiguous_fraction",
+)
+
 
 def csv_bytes(columns: Sequence[str], rows: Iterable[Mapping[str, Cell]]) -> bytes:
     """The rows as a CSV file with exactly `columns`. Raises ValueError for a row with other keys."""

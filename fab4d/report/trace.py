@@ -8,20 +8,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fab4d.io.csvtable import csv_bytes, read_csv
+from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 
-COLUMNS = (
-    "solver",
-    "phase",
-    "wall_s",
-    "tau",
-    "rms_mm",
-    "max_mm",
-    "hausdorff_mm",
-    "smp_fraction",
-    "forces",
-    "ambiguous_fraction",
-)
 WORDS = ("solver", "phase")
 
 Row = dict[str, Any]
@@ -39,13 +27,13 @@ def joined_trace(
     rows: list[Row] = []
     for stage, data in traces.items():
         if data is not None:
-            rows += _shifted(read_csv(data, COLUMNS, f"{stage} trace"), _start(stage, stages), tau_s)
+            rows += _shifted(read_csv(data, TRACE_COLUMNS, f"{stage} trace"), _start(stage, stages), tau_s)
     return rows
 
 
 def trace_csv(rows: list[Row]) -> bytes:
     """error-vs-time.csv."""
-    return csv_bytes(COLUMNS, rows)
+    return csv_bytes(TRACE_COLUMNS, rows)
 
 
 def trace_plot(rows: list[Row], tolerance: float) -> bytes:
@@ -81,7 +69,9 @@ def _start(stage: str, stages: Sequence[Mapping[str, Any]]) -> float:
 
 
 def _shifted(rows: list[dict[str, str]], start: float, tau_s: float | None) -> list[Row]:
-    numbers: list[Row] = [{name: row[name] if name in WORDS else float(row[name]) for name in COLUMNS} for row in rows]
+    numbers: list[Row] = [
+        {name: row[name] if name in WORDS else float(row[name]) for name in TRACE_COLUMNS} for row in rows
+    ]
     for row in numbers:
         row["wall_s"] += start
         row["tau"] += start / tau_s if tau_s else 0.0

@@ -12,7 +12,7 @@ from fab4d.design.patches import Patches, patches_from_faces
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import Search, at_rest
 from fab4d.fabrication.labels import ambiguous_fraction
-from fab4d.io.csvtable import csv_bytes, read_csv
+from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.distance import shape_error
@@ -26,19 +26,6 @@ DEFAULT_TOLERANCE = 5e-3
 LAM_SMP, LAM_SMOOTH = 0.05, 2.5
 # Limits of rig and material are penalties, exceeded a little where the error pulls: they begin below the true limit.
 LIMIT_MARGIN = 0.9
-
-TRACE_COLUMNS = (
-    "solver",
-    "phase",
-    "wall_s",
-    "tau",
-    "rms_mm",
-    "max_mm",
-    "hausdorff_mm",
-    "smp_fraction",
-    "forces",
-    "ambiguous_fraction",
-)
 
 
 def problem_of(mesh: Mapping[str, np.ndarray], materials: MaterialCard, element: str) -> Problem:

@@ -11,9 +11,8 @@ import pytest
 from PIL import Image
 
 from fab4d.errors import ArtifactError
-from fab4d.io.csvtable import csv_bytes, read_csv
+from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal
-from fab4d.report.trace import COLUMNS
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.report import run
 
@@ -76,7 +75,7 @@ def test_default_tolerance_is_a_part_of_the_diagonal(inputs, profile, bar):
 
 
 def test_times_are_counted_from_the_start_of_the_run(result):
-    rows = read_csv(result["error_vs_time"], COLUMNS, "error-vs-time.csv")
+    rows = read_csv(result["error_vs_time"], TRACE_COLUMNS, "error-vs-time.csv")
     wall = np.array([float(r["wall_s"]) for r in rows])
     tau = np.array([float(r["tau"]) for r in rows])
     assert len(rows) == 35
@@ -87,7 +86,7 @@ def test_times_are_counted_from_the_start_of_the_run(result):
 
 
 def test_a_trace_without_a_column_is_refused(inputs, profile):
-    inputs["refit_trace"] = csv_bytes(COLUMNS[:-1], [])
+    inputs["refit_trace"] = csv_bytes(TRACE_COLUMNS[:-1], [])
     with pytest.raises(ArtifactError, match="refit trace: no column ambiguous_fraction"):
         run(inputs, profile, SilentMonitor())
 
