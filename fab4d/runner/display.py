@@ -13,6 +13,7 @@ _FORMS: Mapping[str, Callable[[float], str]] = {
     "rms_mm": lambda value: f"RMS {value:.3g} mm",
     "max_mm": lambda value: f"max {value:.3g} mm",
     "forces": lambda value: f"{value:.0f} forces",
+    "tets": lambda value: f"{value:.0f} tets",
     "smp_fraction": lambda value: f"SMP {100 * value:.1f} %",
     "tau": lambda value: f"{value:.0f} tau",
 }

@@ -37,7 +37,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     Raises BodyError when a body is no solid, before and after its STL file is read back, or when the two do not fit.
     """
     mesh, labels = inputs["mesh"], inputs["labels"]
-    monitor.progress("bodies", tets=len(mesh["tets"]))
+    monitor.progress("surfaces", tets=len(mesh["tets"]))
     return print_files(
         mesh["X"], mesh["tets"], labels["smp"].astype(bool), profile["name"], profile["printer"], profile["materials"]
     )

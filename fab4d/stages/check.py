@@ -57,7 +57,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     ]
     pair = _pair(permanent, temporary, mm_per(profile["units"]))
     for name, step in _steps(profile["materials"]).items():
-        monitor.progress(f"check {name}")
+        monitor.progress(name)
         pair, found = step(pair)
         findings += _refuse(found)
     clamp = resolve_clamp(profile["clamp"], pair, permanent)

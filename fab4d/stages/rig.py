@@ -18,11 +18,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     state = inputs["state"]
     if state is None or len(state["patch_center"]) == 0:
         return _nothing_to_set_up()
-    monitor.progress("rig plan")
+    monitor.progress("plan")
     plan = rig_plan(state, profile["materials"])
     rig = profile["rig"]
     reasons = limit_reasons(plan.points, rig.max_force, rig.max_points, rig.pull_only)
-    monitor.progress("rig sheet", forces=plan.points.count)
+    monitor.progress("sheet", forces=plan.points.count)
     return {
         "rig_sheet": rig_sheet(profile["name"], plan, _figure(state, inputs["labels"]), reasons),
         "forces_csv": csv_bytes(FORCE_COLUMNS, force_rows(plan.points, inputs["mesh"]["vertex_map"])),

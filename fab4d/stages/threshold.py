@@ -28,7 +28,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     """Round the density, remove what cannot be printed, and judge the design by the two acceptance checks."""
     X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
     rho = inputs["relaxed"]["rho"]
-    monitor.progress("threshold", tets=len(tets))
+    monitor.progress("clean-up", tets=len(tets))
     labels = labels_for(X, tets, rho, profile["printer"])
     report = _report(X, tets, rho, labels, profile["acceptance"])
     return {"labels": {"smp": labels.smp, "cluster": labels.cluster}, "threshold_report": report}
