@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fab4d.io.cards import load_material, load_printer, load_rig
-from fab4d.io.csvtable import csv_bytes
+from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes
 from fab4d.io.scene import Acceptance, Goal
-from fab4d.report.trace import COLUMNS
 
 
 @pytest.fixture(scope="session")
@@ -40,7 +39,7 @@ def trace(solver: str, phases: list[str], n: int) -> bytes:
         }
         for k in range(n)
     ]
-    return csv_bytes(COLUMNS, rows)
+    return csv_bytes(TRACE_COLUMNS, rows)
 
 
 @pytest.fixture
