@@ -187,7 +187,7 @@ def _stage_command(name: str) -> click.Command:
 @main.command(cls=Command)
 @_scene_command
 def plan(scene: Path, out: Path | None) -> None:
-    """Tell what would run and roughly how long, and what is left out and why."""
+    """Tell what would run, how long, and what is left out."""
     from fab4d.runner.outlook import plan_lines
 
     with tempfile.TemporaryDirectory() as folder:
