@@ -16,21 +16,21 @@ from fab4d.runner.runner import Selection, Step, plan
 from fab4d.runner.table import stage_table
 from fab4d.runner.workspace import Workspace
 
-# Fitted to the six samples strip to snake (240 to 14,400 tets) on two cores busy with other work.
+# Fitted to the seven samples (240 to 14,400 tets; slice: to the first five) on two cores busy with other work.
 # Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
 STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (1.83, 0.16),
-    "solve": (10.9, 0.98),
-    "threshold": (0.208, 0.62),
-    "refit": (2.71, 0.69),
-    "verify": (2.54, 0.97),
-    "bodies": (0.168, 0.62),
-    "slice": (1.5, 0.7),
-    "rig": (0.977, 0.26),
-    "report": (2.35, 0.15),
+    "check": (1.09, 0.13),
+    "solve": (10.7, 0.87),
+    "threshold": (0.0872, 0.65),
+    "refit": (1.72, 0.85),
+    "verify": (1.22, 1.18),
+    "bodies": (0.104, 0.59),
+    "slice": (2.56, 1.05),
+    "rig": (0.702, 0.12),
+    "report": (1.48, 0.14),
 }
 # Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (273.0, 21.0)
+MEMORY_MB = (286.0, 21.3)
 
 
 def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[str, Any]) -> list[str]:
