@@ -8,6 +8,7 @@ from numba import njit
 from fab4d.fabrication._links import Links
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
+# Loops instead of sums, copies and assignments of slices: numba's code for these takes long to compile.
 # Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile.
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _inner = njit(cache=True, **_NO_ENTRY)
@@ -96,8 +97,9 @@ def vertex_defects(v: int, pinched: BoolArray, smp: BoolArray, links: Links, scr
     """
     _load_bits(v, smp, links, scratch)
     if pinched[v]:
-        size = links.star_start[v + 1] - links.star_start[v]
-        n_smp = scratch.bits[:size].sum()
+        size, n_smp = links.star_start[v + 1] - links.star_start[v], 0
+        for k in range(size):
+            n_smp += scratch.bits[k]
         return min(n_smp, size - n_smp)
     defects = _boundary_excess(v, True, links, scratch)
     if links.on_surface[v]:
@@ -207,7 +209,8 @@ def _try(count: int, step: int, best: tuple, state: State, links: Links, scratch
     rank, price = (0, price / -change) if change < 0 else (1 + change, price)
     if rank > best[0] or (rank == best[0] and price >= best[1]):
         return best
-    scratch.best[:count] = tets
+    for k in range(count):
+        scratch.best[k] = tets[k]
     return rank, price, count
 
 
@@ -264,7 +267,7 @@ def _pop(queue: Queue) -> int:
 
 @_inner
 def _apply(count: int, step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> None:
-    tets = scratch.best[:count].copy()
+    tets = scratch.best[:count]
     _flip(tets, state)
     stamp = _fresh_stamp(scratch)
     for t in tets:
@@ -297,4 +300,7 @@ def search(state: State, links: Links, scratch: Scratch, queue: Queue) -> int:
         skips[v] += count == 0
         if state.defects[v] > 0 and skips[v] < MOST_SKIPS:
             _push(v, count > 0, queue)
-    return state.defects.sum()
+    left = 0
+    for defects in state.defects:
+        left += defects
+    return left

@@ -52,8 +52,10 @@ def thin_places(X: FloatArray, tets: IntArray, smp: BoolArray, feature_xy: float
     scaled = X / np.array([feature_xy, feature_xy, feature_z])
     incentres, inradii = _incircles(scaled, tets)
     narrow = inradii < RADIUS
-    points, neighbours = _sample_points(scaled, tets, incentres), tet_neighbours(tets)
     thin = np.zeros(len(tets), bool)
+    if not narrow.any():
+        return thin
+    points, neighbours = _sample_points(scaled, tets, incentres), tet_neighbours(tets)
     for label in (True, False):
         inside = np.asarray(smp) == label
         thin |= narrow & inside & ~_mostly_covered(scaled, tets, neighbours, points, narrow, inside)

@@ -38,7 +38,8 @@ def well_composed(tets: IntArray, smp: BoolArray, flip_cost: FloatArray) -> Bool
     nowhere = np.zeros(len(links.n_nodes), bool)
     pinched = all_defects(nowhere, np.ones(len(tets), bool), links, scratch) > 0
     state = _state(smp, smp, flip_cost, pinched, FREE, links, scratch)
-    if search(state, links, scratch, _queue(links)) == 0:
+    # Where nothing is to be done the search need not even be compiled.
+    if not state.defects.any() or search(state, links, scratch, _queue(links)) == 0:
         return state.smp
     return _one_way(state, links, scratch)
 
