@@ -28,10 +28,9 @@ SEARCH_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A density rho (m,), held positions c (K, 3), and the two equilibria that follow."""
+    """A density rho (m,) and the two equilibria that follow from it and the held positions."""
 
     rho: FloatArray
-    held: FloatArray
     median: Median
     final: Final
 
@@ -51,7 +50,7 @@ def equilibrate(
     if not median.solution.converged:
         return None
     final = equilibria.solve_final(rho, median, y, tolerance, max_iterations)
-    return Design(rho, held, median, final) if final.solution.converged else None
+    return Design(rho, median, final) if final.solution.converged else None
 
 
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.

@@ -111,18 +111,15 @@ def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibri
     if not final.solution.converged:
         msg = f"the first design finds no final shape ({final.solution.status.value}): check the temporary shape"
         raise EquilibriumError(msg)
-    return equilibria, Design(rho, held_positions(equilibria, median), median, final)
+    return equilibria, Design(rho, median, final)
 
 
 def at_rest(problem: Problem) -> Search:
     """The part of TPE alone, with nothing held: it stays in its permanent shape."""
-    equilibria, rho, X = (
-        Equilibria(problem, build_patches(problem, np.zeros(0, np.int64), 0.0)),
-        np.zeros(problem.n_tets),
-        problem.body.X,
-    )
+    equilibria = Equilibria(problem, build_patches(problem, np.zeros(0, np.int64), 0.0))
+    rho, X = np.zeros(problem.n_tets), problem.body.X
     median = equilibria.solve_median(rho, np.zeros((0, 3)), X, np.zeros((0, 3)))
-    design = Design(rho, np.zeros((0, 3)), median, equilibria.solve_final(rho, median, X))
+    design = Design(rho, median, equilibria.solve_final(rho, median, X))
     return Search(equilibria, design, Phase.DONE)
 
 

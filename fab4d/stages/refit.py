@@ -64,7 +64,7 @@ def _printed_design(equilibria: Equilibria, design: Design, smp: FloatArray) -> 
 
 
 def _programmed(done: Programming, smp: FloatArray) -> Design:
-    return Design(smp, np.zeros((0, 3)), done.median, done.final)
+    return Design(smp, done.median, done.final)
 
 
 def _reachable_fit(

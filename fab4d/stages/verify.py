@@ -84,7 +84,7 @@ def _state(equilibria: Equilibria, smp: FloatArray, done: Programming) -> dict[s
     x = done.median.x * L0
     reaction = g[problem.clamp] * force
     arms = x[problem.clamp] - x[problem.clamp].mean(axis=0) if problem.clamp.any() else np.zeros((0, 3))
-    design = Design(smp, np.zeros((0, 3)), done.median, done.final)
+    design = Design(smp, done.median, done.final)
     return {
         "nodes": problem.body.X * L0,
         "elements": problem.body.elements,

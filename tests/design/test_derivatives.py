@@ -7,7 +7,7 @@ import pytest
 from bars import TIGHT, bar, held_design, mixed_density, two_patches
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate
+from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, held_positions
 from fab4d.design.objective import ObjectiveWeights, density_terms, smoothness_matrix
 from fab4d.design.sensitivity import linearise
 
@@ -27,11 +27,12 @@ class Moved:
         rng = np.random.default_rng(seed)
         self.equilibria, self.at = equilibria, at
         self.drho = rng.standard_normal(len(at.rho))
-        self.dc = 0.1 * rng.standard_normal(at.held.shape)
+        self.held = held_positions(equilibria, at.median)
+        self.dc = 0.1 * rng.standard_normal(self.held.shape)
 
     def __call__(self, t: float) -> Design:
         at = self.at
-        rho, held = at.rho + t * self.drho, at.held + t * self.dc
+        rho, held = at.rho + t * self.drho, self.held + t * self.dc
         moved = equilibrate(self.equilibria, rho, held, at.median.x, at.median.forces, at.final.y, TIGHT, 30)
         assert moved is not None
         return moved
@@ -147,7 +148,7 @@ def test_smoothness_sums_squared_jumps_over_interior_faces() -> None:
 def dense_schur(moved: Moved, weights: ObjectiveWeights, damping: float, held_damping: np.ndarray) -> np.ndarray:
     """H_rr - H_rc H_cc^-1 H_cr from explicit Jacobians and an explicit projection along the rigid modes."""
     equilibria, at = moved.equilibria, moved.at
-    problem, m, k = equilibria.problem, len(at.rho), at.held.size
+    problem, m, k = equilibria.problem, len(at.rho), at.median.forces.size
     lin = linearise(equilibria, at.rho, at.median, at.final)
     model = build_model(equilibria, weights, smoothness_matrix(problem), at)
     columns = []

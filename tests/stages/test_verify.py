@@ -50,7 +50,7 @@ def printed(scene: Arrays, labels: Arrays) -> Arrays:
     assert median.solution.converged
     assert final.solution.converged
     shapes = {"x": median.x * problem.length, "y": final.y * problem.length}
-    return shapes | patch_arrays(problem, patches, Design(rho, patches.mean(median.x), median, final))
+    return shapes | patch_arrays(problem, patches, Design(rho, median, final))
 
 
 def verified(scene: Arrays, labels: Arrays, printed: Arrays, card: Any = CARD) -> tuple[Arrays, dict[str, Any]]:
