@@ -193,6 +193,11 @@ def cura_settings(printer: PrinterCard) -> dict[str, str]:
         "bottom_layers": "0",
         "initial_bottom_layers": "0",
         "meshfix_union_all": "false",
+        # The bodies share their interface: the default grows one of them into the other.
+        "multiple_mesh_overlap": "0",
+        "carve_multiple_volumes": "false",
+        "filter_out_tiny_gaps": "false",
+        "minimum_polygon_circumference": "0",
         "material_diameter": f"{printer.filament_diameter:g}",
         "machine_nozzle_size": f"{printer.nozzle:g}",
     }

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from fab4d.io.cards import load_material, load_printer
+from fab4d.io.meshes import RawMesh
 from fab4d.io.slicers import Slice, Slicer, filament_length, installed_slicers
 from fab4d.stages import bodies
 from fab4d.stages import slice as slicing
+from fab4d.stages._labelled import labelled_bodies
 from fab4d.stages.monitor import SilentMonitor
 
 PRINTER = load_printer("generic-dual-0.4", Path())
@@ -26,18 +28,28 @@ def run(files):
     return slicing.run(files, {}, SilentMonitor())["slice_report"]
 
 
-@pytest.mark.parametrize("kind", ["prusa", "cura"])
-def test_bodies_are_laid_down_by_their_tools(files, kind):
-    for slicer in installed_slicers():
-        if slicer.kind == kind:
-            break
-    else:
-        pytest.skip(f"{kind} is not installed")
+@pytest.fixture(params=["prusa", "cura"])
+def slicer(request):
+    found = [slicer for slicer in installed_slicers() if slicer.kind == request.param]
+    return found[0] if found else pytest.skip(f"{request.param} is not installed")
+
+
+def test_bodies_are_laid_down_by_their_tools(files, slicer):
     report = slicing.slice_report(slicer, files)
     assert [check["ok"] for check in report["checks"]] == [True, True]
     assert report["bodies"]["smp"]["sliced_mm3"] == pytest.approx(5000, rel=0.03)
     assert report["bodies"]["tpe"]["sliced_mm3"] == pytest.approx(10000, rel=0.03)
     assert report["print_time_s"] > 600
+
+
+@pytest.mark.parametrize("size", [2.0, 5.0])
+def test_coin_toss_labels_are_laid_down_too(mesh, slicer, size):
+    raw = RawMesh(mesh["X"] * size / 5, mesh["tets"], {}, "box.vtu")
+    smp = np.random.default_rng(1).random(len(raw.tets)) < 0.5
+    files = labelled_bodies(raw, smp, 1.0, "box", PROFILE["printer"], PROFILE["materials"])
+    report = slicing.slice_report(slicer, files)
+    assert min(body["volume_mm3"] for body in report["bodies"].values()) > 0.2 * 120 * size**3
+    assert [check["ok"] for check in report["checks"]] == [True, True]
 
 
 def lay_down(monkeypatch, *volumes):
