@@ -222,39 +222,35 @@ for _stage in stage_table().between("solve", "verify"):
 @click.argument("scene", metavar="SCENE|MESH", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Run folder; runs/<name of the scene> if not given.")
 @click.option("--labels", metavar="FIELD", help="Take MESH, a tet mesh, with this cell field: 1 is SMP, 0 is TPE.")
-@click.option("--units", default="mm", show_default=True, help="Of MESH, with --labels: mm, cm, m or in.")
-@click.option("--printer", default="generic-dual-0.4", show_default=True, help="Card, with --labels.")
-@click.option("--materials", default="paper-corrected", show_default=True, help="Card, with --labels.")
+@click.option("--units", help="Of MESH: mm if not given, cm, m or in.")
+@click.option("--printer", metavar="CARD", help="For MESH; generic-dual-0.4 if not given.")
+@click.option("--materials", metavar="CARD", help="For MESH; paper-corrected if not given.")
 @click.option("--force", is_flag=True, help="Run bodies even where it is current.")
 @click.option("--quiet", is_flag=True, help="Show no progress.")
-def bodies(
-    scene: Path,
-    out: Path | None,
-    labels: str | None,
-    units: str,
-    printer: str,
-    materials: str,
-    force: bool,
-    quiet: bool,
-) -> None:
+def bodies(scene: Path, out: Path | None, labels: str | None, force: bool, quiet: bool, **of_mesh: str | None) -> None:
     from fab4d.runner.runner import Selection
     from fab4d.runner.summary import body_lines
 
+    given = {name: value for name, value in of_mesh.items() if value is not None}
+    if labels is None and given:
+        msg = f"--{next(iter(given))} goes with --labels; a scene says it itself"
+        raise click.UsageError(msg)
     if labels is None:
         job = _open_job(scene, out)
         _run(job, Selection(None, "bodies", frozenset({"bodies"} if force else ())), quiet)
         workspace = job.workspace
     else:
-        workspace = _labelled_workspace(scene, out, labels, units, printer, materials)
+        workspace = _labelled_workspace(scene, out, labels, **given)
     click.echo("\n".join(body_lines(workspace.load("bodies_report"))))
 
 
 def _labelled_workspace(
-    mesh: Path, out: Path | None, field: str, units: str, printer: str, materials: str
+    mesh: Path, out: Path | None, field: str, units: str = "mm", printer: str = "", materials: str = ""
 ) -> "Workspace":
     """A run folder with the bodies of a labelled mesh."""
     from fab4d.io.cards import load_material, load_printer
     from fab4d.io.meshes import read_labelled_mesh
+    from fab4d.io.scene import DEFAULT_CARDS
     from fab4d.runner.summary import file_lines
     from fab4d.runner.workspace import Workspace
     from fab4d.stages._labelled import labelled_bodies
@@ -262,9 +258,13 @@ def _labelled_workspace(
 
     workspace = Workspace(out or Path("runs") / f"{_file_name(mesh.stem)}-bodies", stage_table().artifacts)
     raw, smp = read_labelled_mesh(mesh, field)
-    cards = load_printer(printer, Path()), load_material(materials, Path())
+    cards = (
+        load_printer(printer or DEFAULT_CARDS["printer"], Path()),
+        load_material(materials or DEFAULT_CARDS["materials"], Path()),
+    )
+    artifacts = labelled_bodies(raw, smp, mm_per(units), mesh.stem, *cards)
     with workspace.locked():
-        workspace.save(labelled_bodies(raw, smp, mm_per(units), mesh.stem, *cards))
+        workspace.save(artifacts)
     click.echo("\n".join(file_lines(workspace)))
     return workspace
 

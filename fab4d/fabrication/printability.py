@@ -133,7 +133,7 @@ def _interface_areas(X: FloatArray, tets: IntArray, smp: BoolArray, cluster: Int
 
 def _pieces(tets: IntArray) -> PrintCheck:
     pieces = int(component_labels(len(tets), face_table(tets).interior_tets).max()) + 1
-    return PrintCheck("pieces of the part", pieces == 1, pieces, "at most", 1, "pieces")
+    return PrintCheck("pieces of the part", pieces == 1, pieces, "at most", 1, "")
 
 
 def _held_by_an_edge(X: FloatArray, tets: IntArray, smp: BoolArray) -> PrintCheck:
