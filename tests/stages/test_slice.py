@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fab4d.io.cards import load_material, load_printer
-from fab4d.io.meshes import RawMesh
+from fab4d.io.meshes import RawMesh, read_mesh
 from fab4d.io.slicers import Slice, Slicer, filament_length, installed_slicers
 from fab4d.stages import bodies
 from fab4d.stages import slice as slicing
@@ -15,6 +15,7 @@ from fab4d.stages.monitor import SilentMonitor
 
 PRINTER = load_printer("generic-dual-0.4", Path())
 PROFILE = {"name": "box", "printer": PRINTER, "materials": load_material("paper-corrected", Path())}
+SAMPLES = Path(__file__).parents[2] / "samples"
 FAKE = Slicer("prusa", Path("fake"))
 
 
@@ -50,6 +51,17 @@ def test_coin_toss_labels_are_laid_down_too(mesh, slicer, size):
     report = slicing.slice_report(slicer, files)
     assert min(body["volume_mm3"] for body in report["bodies"].values()) > 0.2 * 120 * size**3
     assert [check["ok"] for check in report["checks"]] == [True, True]
+
+
+@pytest.mark.parametrize("sample", ["strip", "twist-bar", "gripper", "smiley"])
+def test_samples_are_laid_down_in_stripes_too(slicer, sample):
+    """Stripes of both materials across the longest side."""
+    raw = read_mesh(SAMPLES / sample / "perm.vtu")
+    centres = raw.points[raw.tets].mean(axis=1)
+    along = centres[:, np.argmax(np.ptp(raw.points, axis=0))]
+    smp = np.floor(5 * (along - along.min()) / np.ptp(along)).astype(int) % 2 == 0
+    files = labelled_bodies(raw, smp, 1.0, sample, PROFILE["printer"], PROFILE["materials"])
+    assert [check["ok"] for check in slicing.slice_report(slicer, files)["checks"]] == [True, True]
 
 
 def lay_down(monkeypatch, *volumes):
