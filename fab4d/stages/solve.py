@@ -35,6 +35,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         )
         raise SceneError(msg)
     problem = problem_of(mesh, profile["materials"], "linear")
+    monitor.progress("compile, measure tau")
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     if inputs["check_report"]["nothing_to_program"]:
