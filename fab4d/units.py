@@ -6,7 +6,6 @@ from typing import Final
 from fab4d.errors import SceneError
 
 MM_PER_UNIT: Final = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4})
-MPA_PER_PA: Final = 1e-6
 N_PER_KGF: Final = 9.80665
 
 

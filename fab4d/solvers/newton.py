@@ -17,7 +17,6 @@ class Status(Enum):
     MAX_ITERATIONS = "the residual is still above the tolerance after the most iterations"
     NO_STEP = "no step along the Newton direction lowers the residual inside the domain"
     SINGULAR = "the tangent is singular"
-    UNSTABLE = "the equilibrium is unstable: the tangent has too many negative eigenvalues"
 
 
 MAX_HALVINGS = 20
