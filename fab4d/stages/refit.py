@@ -33,7 +33,8 @@ LEFT_OUT = {
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
-    mesh, relaxed, smp = inputs["mesh"], inputs["relaxed"], inputs["labels"]["smp"].astype(np.float64)
+    mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
+    smp = rounded["smp"].astype(np.float64)
     element = profile["solver"].element
     problem = problem_of(mesh, profile["materials"], element)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
@@ -49,6 +50,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
     reasons = _limit_reasons(problem, equilibria.patches, design, profile)
     return {
+        "labels": dict(rounded),
         "printed": printed,
         "refit_report": {"fits": fits, "reasons": reasons, "left_out": LEFT_OUT[element]},
         "refit_trace": trace.csv(),

@@ -31,7 +31,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     monitor.progress("clean-up", tets=len(tets))
     labels = labels_for(X, tets, rho, profile["printer"])
     report = _report(X, tets, rho, labels, profile["acceptance"])
-    return {"labels": {"smp": labels.smp, "cluster": labels.cluster}, "threshold_report": report}
+    return {"rounded": {"smp": labels.smp, "cluster": labels.cluster}, "threshold_report": report}
 
 
 def labels_for(X: FloatArray, tets: IntArray, rho: FloatArray, printer: PrinterCard) -> LabelResult:

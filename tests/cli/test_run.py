@@ -33,6 +33,7 @@ SAME_FILES = (
     "print/part.3mf",
     "rig/forces.csv",
     "rig/rig-sheet.pdf",
+    "work/rounded.npz",
     "work/labels.npz",
     "work/state.npz",
 )

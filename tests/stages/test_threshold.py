@@ -17,8 +17,8 @@ PRINTER = load_printer("generic-dual-0.4", Path())
 def run(mesh, rho, printer=PRINTER, acceptance=None):
     profile = {"printer": printer, "acceptance": acceptance or Acceptance()}
     out = threshold.run({"mesh": mesh, "relaxed": {"rho": rho}}, profile, SilentMonitor())
-    assert set(out) == {"labels", "threshold_report"}
-    return out["labels"], out["threshold_report"]
+    assert set(out) == {"rounded", "threshold_report"}
+    return out["rounded"], out["threshold_report"]
 
 
 def half(mesh):
