@@ -5,9 +5,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from fab4d.design.patches import Patches
 from fab4d.design.problem import Problem
+from fab4d.design.turning import Turning
 from fab4d.elasticity import _kernels as kernels
 from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern, build_pattern, dirichlet_mask
 from fab4d.mesh.tetmesh import FloatArray, IntArray
@@ -133,10 +135,20 @@ class Equilibria:
     def with_patches(self, patches: Patches) -> "Equilibria":
         """The same problem with other patches; what does not depend on them is kept."""
         other = Equilibria(self.problem, patches)
-        for name in ("free_pattern", "free_analysis", "_free_masks", "block_structure"):
+        for name in ("free_pattern", "free_analysis", "_free_masks", "block_structure", "free_turning"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
         return other
+
+    @cached_property
+    def held_turning(self) -> Turning:
+        """Bends steps of the median shape."""
+        return Turning(self.problem.body, np.flatnonzero(self.problem.clamp), self.operator)
+
+    @cached_property
+    def free_turning(self) -> Turning:
+        """Bends steps of the final shape."""
+        return Turning(self.problem.body, np.zeros(0, np.int64), csr_array((0, self.problem.n_nodes)))
 
     @cached_property
     def block_structure(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
@@ -208,8 +220,12 @@ class Equilibria:
         def fallback(z: FloatArray) -> Factor:
             return self.held_analysis.factor(self.median_tangent(rho, z[:n].reshape(shape), spd=True))
 
+        def advance(z: FloatArray, step: FloatArray) -> FloatArray:
+            ahead = self.held_turning.step(z[:n].reshape(shape), step[:n].reshape(shape))
+            return np.concatenate([ahead.ravel(), z[n:] + step[n:]])
+
         z = np.concatenate([x.ravel(), forces.ravel()])
-        solution = newton(residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count)
+        solution = newton(residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count, advance)
         x = solution.z[:n].reshape(shape)
         gradients = np.zeros_like(self.problem.body.dN)
         kernels.deformed_gradients(self.problem.body.elements, self.problem.body.dN, x - self.problem.body.X, gradients)
@@ -282,7 +298,14 @@ class Equilibria:
             tangent = self.free_analysis.factor(self.final_tangent(rho, median, at, spd, unloaded))
             return Pinned(tangent, self.free_mask(at).fixed)
 
-        solution = newton(
-            residual, lambda z: pinned(z, False), y.ravel(), tolerance, max_iterations, lambda z: pinned(z, True), 0
-        )
+        def advance(z: FloatArray, step: FloatArray) -> FloatArray:
+            return self.free_turning.step(z.reshape(shape), step.reshape(shape)).ravel()
+
+        def factor(z: FloatArray) -> Factor:
+            return pinned(z, False)
+
+        def fallback(z: FloatArray) -> Factor:
+            return pinned(z, True)
+
+        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0, advance)
         return Final(solution.z.reshape(shape), solution)

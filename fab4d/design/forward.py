@@ -1,6 +1,8 @@
 """Forward simulation of a finished design, from the permanent shape, the way the rig will do it."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,8 +12,11 @@ from fab4d.elasticity import _kernels as kernels
 from fab4d.mesh.interpolation import shape_path
 from fab4d.mesh.tetmesh import FloatArray
 
-FIRST_STEP, SMALLEST_STEP = 0.05, 1e-3
+FIRST_LOAD, FIRST_UNLOAD, SMALLEST_STEP = 0.05, 0.25, 1e-3
 PATH_TOLERANCE, END_TOLERANCE = 1e-7, 1e-11
+PATH_ITERATIONS, END_ITERATIONS = 12, 10
+# A load step that takes fewer Newton iterations makes the next one longer, one that takes more, shorter.
+USUAL_ITERATIONS = 8
 # Farther apart, relative to the diagonal, two median shapes are different equilibria.
 SAME_SHAPE = 1e-5
 
@@ -54,30 +59,57 @@ def _load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatA
     def held(t: float) -> FloatArray:
         return patches.mean(at_nodes(problem, path.at(t))) + t * correction
 
+    def solve(t: float, guess: Median, tolerance: float, iterations: int) -> Median:
+        return equilibria.solve_median(rho, held(t), guess.x, guess.forces, tolerance, iterations)
+
+    def onwards(before: Median, now: Median, ratio: float, t: float) -> Median:
+        force = now.forces + ratio * (now.forces - before.forces)
+        gap = held(t) - RIG_COMPLIANCE * force - patches.mean(now.x)
+        return replace(now, x=equilibria.held_turning.repeat(before.x, now.x, now.x, ratio, gap), forces=force)
+
     none = np.zeros((patches.count, 3))
-    median = equilibria.solve_median(rho, patches.mean(problem.body.X), problem.body.X, none)
-    done, step, steps = 0.0, FIRST_STEP, 0
-    while done < 1.0 and step >= SMALLEST_STEP:
-        aim = min(1.0, done + step)
-        trial = equilibria.solve_median(rho, held(aim), median.x, median.forces, PATH_TOLERANCE, 15)
-        if trial.solution.converged:
-            median, done, step, steps = trial, aim, 1.4 * step, steps + 1
-        else:
-            step /= 2
-    return equilibria.solve_median(rho, held(done), median.x, median.forces, END_TOLERANCE, 10), steps, done
+    rest = equilibria.solve_median(rho, patches.mean(problem.body.X), problem.body.X, none)
+    return _follow(rest, solve, onwards, FIRST_LOAD)
 
 
 def _unload(equilibria: Equilibria, rho: FloatArray, median: Median) -> tuple[Final, int, float]:
     """Let the TPE pull the cold part back, little by little: under dead loads the free part would turn over."""
-    y, done, step, steps = median.x, 0.0, 0.25, 0
+
+    def solve(t: float, guess: Final, tolerance: float, iterations: int) -> Final:
+        return equilibria.solve_final(rho, median, guess.y, tolerance, iterations, t)
+
+    def onwards(before: Final, now: Final, ratio: float, t: float) -> Final:  # noqa: ARG001
+        return replace(now, y=equilibria.free_turning.repeat(before.y, now.y, now.y, ratio))
+
+    held = equilibria.solve_final(rho, median, median.x, unloaded=0.0)
+    return _follow(held, solve, onwards, FIRST_UNLOAD)
+
+
+Shape = TypeVar("Shape", Median, Final)
+
+
+def _follow(
+    start: Shape,
+    solve: Callable[[float, Shape, float, int], Shape],
+    onwards: Callable[[Shape, Shape, float, float], Shape],
+    step: float,
+) -> tuple[Shape, int, float]:
+    """The path of equilibria from `start` at t = 0 as far as it goes; returns its end, the steps made and t there.
+
+    solve : t, guess, tolerance, most iterations -> shape        onwards : earlier shape, shape, ratio, t -> guess
+    A guess comes from the two shapes before it alone: nothing but the loading decides where the path leads.
+    """
+    before, now, last, done, steps = start, start, 0.0, 0.0, 0
     while done < 1.0 and step >= SMALLEST_STEP:
-        aim = min(1.0, done + step)
-        trial = equilibria.solve_final(rho, median, y, PATH_TOLERANCE, 15, aim)
+        aim = 1.0 if step >= 1.0 - done else done + (1.0 - done) / np.ceil((1.0 - done) / step)
+        guess = onwards(before, now, (aim - done) / (done - last), aim) if steps else now
+        trial = solve(aim, guess, PATH_TOLERANCE, PATH_ITERATIONS)
         if trial.solution.converged:
-            y, done, step, steps = trial.y, aim, 2 * step, steps + 1
+            step = (aim - done) * min(max(USUAL_ITERATIONS / max(trial.solution.iterations, 1), 0.5), 2.0)
+            before, now, last, done, steps = now, trial, done, aim, steps + 1
         else:
-            step /= 2
-    return equilibria.solve_final(rho, median, y, END_TOLERANCE, 10, done), steps, done
+            step = (aim - done) / 2
+    return solve(done, now, END_TOLERANCE, END_ITERATIONS), steps, done
 
 
 @dataclass(frozen=True)

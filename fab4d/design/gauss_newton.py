@@ -275,7 +275,8 @@ def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArra
     dx, df, dy = model.lin.forward(drho, dc)
     median, y = design.median, design.final.y
     rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
-    guesses = ((median.x + dx, median.forces + df, y + dy), (median.x, median.forces, y))
+    ahead = equilibria.held_turning.step(median.x, dx), median.forces + df, equilibria.free_turning.step(y, dy)
+    guesses = (ahead, (median.x, median.forces, y))
     for x0, f0, y0 in guesses:
         trial = equilibrate(equilibria, rho, held, x0, f0, y0)
         if trial is not None:

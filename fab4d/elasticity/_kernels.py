@@ -380,3 +380,56 @@ def deformed_gradients(elements, dN, u, out):
                         dN[m, q, a, i] + C[i, 0] * dN[m, q, a, 0] + C[i, 1] * dN[m, q, a, 1] + C[i, 2] * dN[m, q, a, 2]
                     ) / (1.0 + jm1)
     return smallest
+
+
+@njit(cache=True)
+def turning_load(elements, dN, weights, u, du, load):
+    """Adds to load (N, 3) the right-hand side whose Poisson solution makes the step du turn elements, not shear them.
+
+    A step changes F by dF = (S + W) F with S symmetric, W skew. The element turned by exp(W) after its stretch has
+    exp(W) (I + S) F instead of F + dF: load_a = sum_q w (exp(W) (I + S) F - F - dF) dN_a, of second order in du.
+    """
+    H, C, G = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    L, W, W2, A, D = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for m in range(elements.shape[0]):
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            _displacement_gradient(du, elements[m], dN[m, q], G)
+            jm1, _ = _invariants(H, C)
+            for i in range(3):
+                for j in range(3):
+                    # F^-1 = (I + C)^T / J
+                    L[i, j] = G[i, j] + G[i, 0] * C[j, 0] + G[i, 1] * C[j, 1] + G[i, 2] * C[j, 2]
+                    L[i, j] /= 1.0 + jm1
+            for i in range(3):
+                for j in range(3):
+                    W[i, j] = 0.5 * (L[i, j] - L[j, i])
+            angle2 = W[0, 1] ** 2 + W[0, 2] ** 2 + W[1, 2] ** 2
+            a1, b = _rotation_series(angle2)
+            for i in range(3):
+                for j in range(3):
+                    W2[i, j] = W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j]
+            # A = exp(W) (I + S) - I - S - W, without the terms that cancel
+            for i in range(3):
+                for j in range(3):
+                    A[i, j] = a1 * W[i, j] + b * W2[i, j]
+                    for k in range(3):
+                        S = 0.5 * (L[k, j] + L[j, k])
+                        A[i, j] += ((1.0 + a1) * W[i, k] + b * W2[i, k]) * S
+            for i in range(3):
+                for j in range(3):
+                    D[i, j] = A[i, j] + A[i, 0] * H[0, j] + A[i, 1] * H[1, j] + A[i, 2] * H[2, j]
+            for a in range(elements.shape[1]):
+                for i in range(3):
+                    load[elements[m, a], i] += weights[m, q] * (
+                        D[i, 0] * dN[m, q, a, 0] + D[i, 1] * dN[m, q, a, 1] + D[i, 2] * dN[m, q, a, 2]
+                    )
+
+
+@njit(cache=True, inline="always")
+def _rotation_series(angle2):
+    """a - 1 and b of exp(W) = I + a W + b W^2, a = sin t / t, b = (1 - cos t) / t^2, t^2 = `angle2`."""
+    if angle2 < 1e-6:
+        return -angle2 / 6.0, 0.5 - angle2 / 24.0
+    angle = math.sqrt(angle2)
+    return math.sin(angle) / angle - 1.0, 2.0 * math.sin(0.5 * angle) ** 2 / angle2

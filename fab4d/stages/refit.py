@@ -7,7 +7,7 @@ import numpy as np
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.forward import Programming, program, same_shape
-from fab4d.design.gauss_newton import Design, equilibrate
+from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import Patches
 from fab4d.design.problem import Problem, at_nodes
@@ -92,7 +92,11 @@ def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -
     x, y = (at_nodes(problem, relaxed[name] / problem.length) for name in ("x", "y"))
     forces = relaxed["patch_force"] / problem.force
     held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
-    design = equilibrate(equilibria, rho, held, x, forces, y, max_iterations=100)
+    median = equilibria.solve_median(rho, held, x, forces, SEARCH_TOLERANCE, 100)
+    design = None
+    if median.solution.converged:
+        y = equilibria.free_turning.repeat(x, y, median.x)
+        design = equilibrate(equilibria, rho, held, median.x, median.forces, y, max_iterations=100)
     if design is None:
         msg = "the relaxed design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
         raise EquilibriumError(msg)
