@@ -8,11 +8,12 @@ from scipy.optimize import minimize
 from fab4d.elasticity._untangle_kernels import regularised_energy
 from fab4d.mesh.measures import bounding_box_diagonal, edge_matrices, vertex_areas
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
-from fab4d.mesh.topology import face_table
+from fab4d.mesh.topology import face_table, vertices_near
 
 # Weight of the surface and rings of vertices around inverted tets (None: all vertices), to try in turn: first the
 # surface is fixed, then held ever more softly, and what moves stays as local as it can.
-_ATTEMPTS = ((np.inf, 3), (np.inf, 8), (1e6, 3), (1e4, 3), (1e4, 8), (1e2, 8), (1e4, None), (1e2, None))
+_INSIDE = ((np.inf, 3), (np.inf, 8), (np.inf, None))
+_SURFACE = ((1e6, 3), (1e4, 3), (1e4, 8), (1e2, 8), (1e4, None), (1e2, None))
 _MAX_ROUNDS = 12
 
 
@@ -38,9 +39,10 @@ class _Region(NamedTuple):
     """Stiffness (free,) of the springs that hold surface vertices to their places."""
 
 
-def untangle(X: FloatArray, x: FloatArray, tets: IntArray) -> Untangled:
+def untangle(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -> Untangled:
     """Move as few and as inner vertices of x (n, 3), mm, as it takes to have det dx/dX > 0 in all tets (m, 4).
 
+    fixed : (n,) vertices that stay where they are
     Raises nothing: `min_det_F` of the result tells whether it succeeded.
     Source: Garanzha et al., Foldover-free maps in 50 lines of code, ACM TOG 40 (2021) 102, eqs. (2)-(4).
     """
@@ -51,10 +53,12 @@ def untangle(X: FloatArray, x: FloatArray, tets: IntArray) -> Untangled:
     boundary = face_table(tets).boundary
     areas = vertex_areas(X, boundary)
     best = target
-    for weight, rings in _ATTEMPTS:
+    attempts = _INSIDE if fixed[areas > 0].all() else _INSIDE + _SURFACE
+    for weight, rings in attempts:
         if not inverted.any() or _dets(best, tets, inverse).min() > 0:
             break
-        region = _region(tets, inverse, inverted, areas / areas.sum(), weight, rings)
+        movable = vertices_near(tets, inverted, len(X), rings) & ~fixed
+        region = _region(tets, inverse, movable, areas / areas.sum(), weight)
         if np.isin(tets[inverted], region.free).any(axis=1).all():
             best = max(best, _relax(target, region), key=lambda y: float(_dets(y, tets, inverse).min()))
     distance = L0 * np.linalg.norm(best - target, axis=1)
@@ -69,28 +73,18 @@ def untangle(X: FloatArray, x: FloatArray, tets: IntArray) -> Untangled:
 def _region(
     tets: IntArray,
     inverse: FloatArray,
-    inverted: BoolArray,
+    movable: BoolArray,
     area_shares: FloatArray,
     weight: float,
-    rings: int | None,
 ) -> _Region:
-    """Vertices within `rings` of an inverted tet (None: all), without the surface ones when `weight` is infinite."""
-    near = _near(tets, inverted, len(area_shares), rings)
+    """The vertices `movable` (n,), without those of the surface when `weight` is infinite."""
     if np.isinf(weight):
-        near &= area_shares == 0
-    seen = near[tets].any(axis=1)
+        movable = movable & (area_shares == 0)
+    seen = movable[tets].any(axis=1)
     volumes = 1.0 / np.abs(np.linalg.det(inverse))
-    free = np.flatnonzero(near)
+    free = np.flatnonzero(movable)
     pull = weight * area_shares[free] if np.isfinite(weight) else np.zeros(len(free))
     return _Region(free, tets[seen], inverse[seen], volumes[seen] / volumes.sum(), pull)
-
-
-def _near(tets: IntArray, inverted: BoolArray, n_vertices: int, rings: int | None) -> BoolArray:
-    near = np.full(n_vertices, rings is None)
-    near[tets[inverted]] = True
-    for _ in range((rings or 1) - 1):
-        near[tets[near[tets].any(axis=1)]] = True
-    return near
 
 
 def _dets(y: FloatArray, tets: IntArray, inverse: FloatArray) -> FloatArray:

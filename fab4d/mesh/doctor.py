@@ -171,6 +171,20 @@ def check_tets(pair: Pair) -> tuple[Pair, list[Finding]]:
     return pair, findings
 
 
+# 7. Mirror image.
+
+
+def check_mirror(pair: Pair) -> tuple[Pair, list[Finding]]:
+    """Whether the surface of the temporary shape is inside out: the volume in it does not depend on inner vertices."""
+    if tet_volumes(pair.X_temp, pair.tets).sum() > 0:
+        return pair, []
+    message = (
+        f"the mirror image of {pair.files[0]} (its surface is inside out): an axis conversion of the exporter "
+        "exchanged or negated one axis in one of the files"
+    )
+    return pair, [finding("mirrored", "error", pair.files[1], message, pair.tet_map)]
+
+
 # 8. Rigid motion.
 
 
@@ -180,8 +194,9 @@ def rigid_residuals(X: FloatArray, X_temp: FloatArray) -> FloatArray:
 
 
 def check_motion(pair: Pair, clamp: BoolArray) -> tuple[bool, list[Finding]]:
-    """Whether both shapes are equal up to a rigid motion, and whether the clamp itself would have to deform."""
-    if rigid_residuals(pair.X, pair.X_temp).max() < _RIGID_RESIDUAL * pair.diagonal:
+    """Whether both surfaces are equal up to a rigid motion, and whether the clamp itself would have to deform."""
+    surface = np.unique(face_table(pair.tets).boundary)
+    if rigid_residuals(pair.X[surface], pair.X_temp[surface]).max() < _RIGID_RESIDUAL * pair.diagonal:
         message = f"equal to {pair.files[0]} up to a rigid motion: nothing to program"
         return True, [finding("nothing-to-program", "warning", pair.files[1], message)]
     moved = clamp_deformation(pair, clamp)
@@ -195,7 +210,15 @@ def check_motion(pair: Pair, clamp: BoolArray) -> tuple[bool, list[Finding]]:
 
 
 def clamp_deformation(pair: Pair, clamp: BoolArray) -> float:
-    return float(rigid_residuals(pair.X[clamp], pair.X_temp[clamp]).max()) if clamp.any() else 0.0
+    held = wanted_clamp(pair, clamp)
+    return float(rigid_residuals(pair.X[held], pair.X_temp[held]).max()) if clamp.any() else 0.0
+
+
+def wanted_clamp(pair: Pair, clamp: BoolArray) -> BoolArray:
+    """The clamp's vertices (n,) on the surface, for only this is wanted; all of the clamp where they could turn."""
+    on_surface = clamp.copy()
+    on_surface[np.setdiff1d(np.arange(len(clamp)), face_table(pair.tets).boundary)] = False
+    return on_surface if _holds(pair.X[on_surface]) else clamp
 
 
 # 9. The boundary and what hangs together.

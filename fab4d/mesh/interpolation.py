@@ -34,7 +34,7 @@ class ShapePath:
         The vertices `fixed` go straight from X to x.
         """
         F = Rotation.from_rotvec(t * self.rotations).as_matrix() @ ((1 - t) * np.eye(3) + t * self.stretches)
-        return _integrate(self.X, self.tets, F, self.fixed, (1 - t) * self.X + t * self.x)
+        return closest_shape(self.X, self.tets, F, self.fixed, (1 - t) * self.X + t * self.x)
 
 
 def shape_path(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -> ShapePath:
@@ -78,8 +78,8 @@ def _nearest_turn(omega: FloatArray, to: FloatArray) -> FloatArray:
     return (angle + 2 * np.pi * turns) * axis
 
 
-def _integrate(X: FloatArray, tets: IntArray, F: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
-    """Shape with gradients closest to F in the volume-weighted least-squares sense, x[fixed] = goal[fixed]."""
+def closest_shape(X: FloatArray, tets: IntArray, F: FloatArray, fixed: IntArray, goal: FloatArray) -> FloatArray:
+    """Shape (n, 3) with gradients closest to F (m, 3, 3), volume-weighted least squares; x[fixed] = goal[fixed]."""
     n = len(X)
     D = np.linalg.inv(edge_matrices(X, tets))
     grads = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fab4d.mesh.tetmesh import IntArray
+from fab4d.mesh.tetmesh import BoolArray, IntArray
 
 # Corners of face i of a tet (opposite corner i), outward for a positively oriented tet.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -63,3 +63,12 @@ def component_labels(n_items: int, pairs: IntArray) -> IntArray:
     """Connected-component number (n_items,) of the graph with edges `pairs` (k, 2)."""
     graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n_items, n_items))
     return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def vertices_near(tets: IntArray, chosen: BoolArray, n_vertices: int, rings: int | None) -> BoolArray:
+    """Vertices (n,) of the `chosen` (m,) tets and of `rings` - 1 layers around them; all for None."""
+    near = np.full(n_vertices, rings is None)
+    near[tets[chosen]] = True
+    for _ in range((rings or 1) - 1):
+        near[tets[near[tets].any(axis=1)]] = True
+    return near

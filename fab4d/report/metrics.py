@@ -44,7 +44,9 @@ def shapes_of(mesh: Mapping[str, np.ndarray], state: Mapping[str, np.ndarray] | 
     """The shapes of a verified state; without one (nothing to program) the part stays as printed."""
     X, faces = mesh["X"], face_table(mesh["tets"]).boundary
     x, y = (X, X) if state is None else (state["x"][: len(X)], state["y"][: len(X)])
-    return Shapes(X, mesh["X_temp"], x, y, faces, vertex_areas(X, faces), bool(mesh["clamp"].any()))
+    # What a projection of the wanted shape costs is part of the error.
+    wanted = mesh.get("X_wanted", mesh["X_temp"])
+    return Shapes(X, wanted, x, y, faces, vertex_areas(X, faces), bool(mesh["clamp"].any()))
 
 
 def final_error(shapes: Shapes) -> ShapeError:

@@ -1,22 +1,22 @@
 """The mesh doctor: two shapes as a user brings them become one clean pair in mm, or a list of what is wrong."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from fab4d.elasticity.untangle import untangle
 from fab4d.errors import MeshError, SceneError
 from fab4d.io.cards import PrinterCard
 from fab4d.io.meshes import RawMesh
-from fab4d.io.scene import ClampRegion
+from fab4d.io.scene import ClampRegion, Goal
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.compatibility import compare_tets, has_repeated_vertex, same_degrees
 from fab4d.mesh.doctor import (
     COINCIDENT,
     Pair,
     check_boundary,
+    check_mirror,
     check_motion,
     check_tets,
     clamp_deformation,
@@ -25,19 +25,18 @@ from fab4d.mesh.doctor import (
     rigid_residuals,
 )
 from fab4d.mesh.findings import Finding, finding, named
-from fab4d.mesh.grid import FINEST_STEP, snapped
+from fab4d.mesh.grid import snapped
 from fab4d.mesh.measures import deformation_gradients, tet_volumes
 from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_components
-from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
+from fab4d.report.verdict import DEFAULT_TOLERANCE
+from fab4d.stages._target import Target, reachable_target
 from fab4d.stages.monitor import Monitor
 from fab4d.units import MM_PER_UNIT, mm_per
 
 SMALLEST_PART_MM, LARGEST_PART_MM = 1.0, 2000.0
 _LARGEST_SIZE_RATIO = 20.0
-_STRONG_COMPRESSION = 0.1  # det F
-_MENDED_SURFACE = 0.05  # of the diagonal
 
 
 Step = Callable[[Pair], tuple[Pair, list[Finding]]]
@@ -56,30 +55,38 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         *_refuse(_check_compatibility(permanent, temporary)),
     ]
     pair = _pair(permanent, temporary, mm_per(profile["units"]))
-    for name, step in _steps(profile["materials"]).items():
+    for name, step in _STEPS.items():
         monitor.progress(name)
         pair, found = step(pair)
         findings += _refuse(found)
     clamp = resolve_clamp(profile["clamp"], pair, permanent)
     nothing_to_program, found = check_motion(pair, clamp)
     findings += [*_refuse(found), *_refuse(check_boundary(pair, clamp))]
+    target = Target(pair, [])
     if not nothing_to_program:
-        pair, found = _clamp_in_place(pair, clamp)
-        findings += found
-    return {"mesh": _arrays(pair, clamp), "check_report": _report(pair, clamp, findings, nothing_to_program)}
+        monitor.progress("target")
+        target = reachable_target(pair, clamp, profile["materials"], _tolerance(profile["goal"], pair))
+        findings += [*_refuse(target.findings), *_strong_deformation(target.pair, profile["materials"])]
+    report = _report(target, clamp, findings, nothing_to_program)
+    return {"mesh": _arrays(target, clamp), "check_report": report}
 
 
-def _steps(materials: MaterialCard) -> dict[str, Step]:
-    return {
-        "clean": clean,
-        "orientation": orient,
-        "tets": check_tets,
-        "deformation": lambda pair: _check_deformation(pair, materials),
-    }
+_STEPS: Mapping[str, Step] = {
+    "clean": clean,
+    "orientation": orient,
+    "tets": check_tets,
+    "mirror image": check_mirror,
+}
 
 
-def _arrays(pair: Pair, clamp: BoolArray) -> dict[str, np.ndarray]:
-    return {
+def _tolerance(goal: Goal, pair: Pair) -> float:
+    return DEFAULT_TOLERANCE * pair.diagonal if goal.tolerance is None else goal.tolerance
+
+
+def _arrays(target: Target, clamp: BoolArray) -> dict[str, np.ndarray]:
+    pair = target.pair
+    asked = {} if target.wanted is None else {"X_wanted": snapped(target.wanted)}
+    return asked | {
         # On the grid, a scene in metres and the same one in millimetres are the same numbers, and so the same design.
         "X": snapped(pair.X),
         "X_temp": snapped(pair.X_temp),
@@ -90,12 +97,13 @@ def _arrays(pair: Pair, clamp: BoolArray) -> dict[str, np.ndarray]:
     }
 
 
-def _report(pair: Pair, clamp: BoolArray, findings: list[Finding], nothing_to_program: bool) -> dict[str, Any]:
+def _report(target: Target, clamp: BoolArray, findings: list[Finding], nothing_to_program: bool) -> dict[str, Any]:
     return {
         "findings": [asdict(found) | {"indices": list(found.indices)} for found in findings],
         "nothing_to_program": nothing_to_program,
-        "statistics": _statistics(pair, clamp),
-        "left_out": _left_out(clamp, nothing_to_program),
+        "statistics": _statistics(target.pair, clamp),
+        "target_projection": target.projection,
+        "left_out": _left_out(target, clamp, nothing_to_program),
     }
 
 
@@ -263,50 +271,9 @@ def _pair(permanent: RawMesh, temporary: RawMesh, mm: float) -> Pair:
 # 7. Deformation to the temporary shape.
 
 
-def _check_deformation(pair: Pair, materials: MaterialCard) -> tuple[Pair, list[Finding]]:
-    J = np.linalg.det(deformation_gradients(pair.X, pair.X_temp, pair.tets))
-    if np.all(J < 0):
-        message = (
-            f"the mirror image of {pair.files[0]} (every tet is inverted): an axis conversion of the exporter "
-            "exchanged or negated one axis in one of the files"
-        )
-        return pair, [finding("mirrored", "error", pair.files[1], message, pair.tet_map)]
-    findings = []
-    if J.min() <= 0:
-        pair, outcome = _mended(pair, J)
-        findings.append(outcome)
-        if outcome.severity == "error":
-            return pair, findings
-    return pair, findings + _strong_deformation(pair, materials)
-
-
-def _mended(pair: Pair, J: FloatArray) -> tuple[Pair, Finding]:
-    inverted = pair.tet_map[J <= 0]
-    mended = untangle(pair.X, pair.X_temp, pair.tets)
-    found = f"{len(inverted)} tets are inverted ({named('tet', inverted)}, det F from {J.min():.3g})"
-    if mended.min_det_F <= 0 or mended.surface_moved > _MENDED_SURFACE * pair.diagonal:
-        message = (
-            f"{found}; relaxing cannot mend them (smallest det F {mended.min_det_F:.3g}, moving the surface by up to "
-            f"{mended.surface_moved:.3g} mm): deform the mesh less, or in smaller steps"
-        )
-        return pair, finding("inverted", "error", pair.files[1], message, inverted)
-    message = (
-        f"{found}; mended by moving {mended.moved} vertices, those of the surface up to {mended.surface_moved:.3g} mm"
-    )
-    return replace(pair, X_temp=mended.x), finding("inverted", "repaired", pair.files[1], message, inverted)
-
-
 def _strong_deformation(pair: Pair, materials: MaterialCard) -> list[Finding]:
-    F = deformation_gradients(pair.X, pair.X_temp, pair.tets)
-    J, stretch = np.linalg.det(F), largest_stretches(F)
+    stretch = largest_stretches(deformation_gradients(pair.X, pair.X_temp, pair.tets))
     findings = []
-    squeezed = pair.tet_map[J < _STRONG_COMPRESSION]
-    if len(squeezed):
-        message = (
-            f"{len(squeezed)} tets are squeezed to less than {_STRONG_COMPRESSION:g} of their volume "
-            f"({named('tet', squeezed)}, det F from {J.min():.3g}): no solid follows there"
-        )
-        findings.append(finding("squeezed", "warning", pair.files[1], message, squeezed))
     for polymer, limit in (("SMP", materials.smp_max_stretch), ("TPE", materials.tpe_max_stretch)):
         torn = pair.tet_map[stretch > limit]
         if len(torn):
@@ -372,19 +339,6 @@ def _box(low: Sequence[float] | FloatArray, high: Sequence[float] | FloatArray) 
     return " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
 
 
-def _clamp_in_place(pair: Pair, clamp: BoolArray) -> tuple[Pair, list[Finding]]:
-    """The temporary shape moved rigidly to where its clamp is that of the permanent one, for the rig does not move."""
-    off = float(np.abs(pair.X_temp[clamp] - pair.X[clamp]).max()) if clamp.any() else 0.0
-    if off <= 2 * FINEST_STEP:
-        return pair, []
-    R, t = best_rigid_motion(pair.X_temp[clamp], pair.X[clamp])
-    message = (
-        f"its clamp region lies up to {off:.3g} mm off that of {pair.files[0]}: moved rigidly to where the rig holds it"
-    )
-    moved = replace(pair, X_temp=pair.X_temp @ R.T + t)
-    return moved, [finding("moved", "repaired", pair.files[1], message)]
-
-
 # What is told.
 
 
@@ -409,13 +363,15 @@ def _statistics(pair: Pair, clamp: BoolArray) -> dict[str, float | int]:
     }
 
 
-def _left_out(clamp: BoolArray, nothing_to_program: bool) -> list[dict[str, str]]:
+def _left_out(target: Target, clamp: BoolArray, nothing_to_program: bool) -> list[dict[str, str]]:
     left_out = [
         {"what": "gravity", "why": "the scene has none"},
         {"what": "self-intersection of the temporary shape", "why": "not checked: look at the shape before printing"},
     ]
     if not clamp.any():
         left_out.append({"what": "clamp", "why": "the scene has none: the forces balance each other"})
+    if target.projection is None and not nothing_to_program:
+        left_out.append({"what": "projection of the temporary shape", "why": "an elastic part can take it as it is"})
     if nothing_to_program:
         why = "the temporary shape is the permanent one, moved rigidly"
         left_out.append({"what": "design, forces and rig sheet", "why": why})

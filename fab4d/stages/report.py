@@ -86,6 +86,7 @@ def _figures(
     return {
         "error": metrics.error_figures(metrics.final_error(shapes), bounding_box_diagonal(shapes.X)),
         "target_displacement_mm": metrics.target_displacement(shapes).rms,
+        "target_projection": inputs["check_report"].get("target_projection"),
         "smp_fraction": metrics.smp_fraction(mesh, smp),
         "forces": metrics.force_count(inputs["state"]),
         "ambiguous_fraction": threshold.get("ambiguous_fraction"),

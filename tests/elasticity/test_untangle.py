@@ -8,6 +8,7 @@ from fab4d.elasticity.untangle import untangle
 from fab4d.mesh.measures import deformation_gradients, edge_matrices
 
 CENTRE = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [2.5, 2.5, 2.5]])
+NONE = np.zeros(5, bool)
 # One tet split in four at an inner vertex.
 TETS = np.array([[4, 1, 2, 3], [0, 4, 2, 3], [0, 1, 4, 3], [0, 1, 2, 4]])
 
@@ -30,7 +31,7 @@ def test_the_gradient_is_that_of_the_energy_also_where_inverted(epsilon: float) 
 
 
 def test_a_sound_shape_is_returned_as_it_is() -> None:
-    mended = untangle(CENTRE, CENTRE * 1.1, TETS)
+    mended = untangle(CENTRE, CENTRE * 1.1, TETS, NONE)
     np.testing.assert_array_equal(mended.x, CENTRE * 1.1)
     assert (mended.surface_moved, mended.moved) == (0, 0)
 
@@ -39,7 +40,7 @@ def test_a_sound_shape_is_returned_as_it_is() -> None:
 def test_an_inner_vertex_is_brought_back_and_the_surface_stays(outside: list[float]) -> None:
     x = CENTRE.copy()
     x[4] = outside
-    mended = untangle(CENTRE, x, TETS)
+    mended = untangle(CENTRE, x, TETS, NONE)
     np.testing.assert_array_equal(mended.x[:4], CENTRE[:4])
     assert mended.surface_moved == 0
     # The best place by symmetry of the energy is near the centroid.
@@ -51,7 +52,7 @@ def test_an_inner_vertex_is_brought_back_and_the_surface_stays(outside: list[flo
 def test_an_inverted_surface_moves_just_as_far_as_told() -> None:
     x = CENTRE.copy()
     x[3, 2] = -0.1
-    mended = untangle(CENTRE, x, TETS)
+    mended = untangle(CENTRE, x, TETS, NONE)
     assert mended.min_det_F > 0
     assert mended.surface_moved == pytest.approx(np.linalg.norm(mended.x - x, axis=1)[:4].max())
     assert mended.surface_moved > 0.1
