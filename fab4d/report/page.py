@@ -92,6 +92,13 @@ def _asset(name: str) -> str:
     return (ASSETS / name).read_text(encoding="utf-8")
 
 
+def _projection(projection: Mapping[str, Any] | None) -> dict[str, str]:
+    """The figure of a temporary shape that was projected to the nearest one that the part can take."""
+    if projection is None:
+        return {}
+    return {"nearest shape that the part can take, RMS from the wanted": f"{plain(projection['rms_mm'])} mm"}
+
+
 def _figures(report: Mapping[str, Any]) -> str:
     error, residual = report["error"], report["equilibrium_residual"]
     shown = {
@@ -100,6 +107,7 @@ def _figures(report: Mapping[str, Any]) -> str:
         "largest error": f"{plain(error['max_mm'])} mm",
         "Hausdorff distance": f"{plain(error['hausdorff_mm'])} mm",
         "prescribed displacement, RMS": f"{plain(report['target_displacement_mm'])} mm",
+        **_projection(report.get("target_projection")),
         "SMP share of the volume": plain(report["smp_fraction"]),
         "forces": str(report["forces"]),
         "fixity": _or_dash(report["fixity"]),

@@ -18,8 +18,15 @@ def _error_text(error: Mapping[str, float]) -> str:
     return ", ".join(parts)
 
 
+def _cost(projection: Mapping[str, Any]) -> str:
+    if not projection["surface_vertices_moved"]:
+        return "as wanted, its inside relaxed anew"
+    return f"RMS {projection['rms_mm']:.3g} mm, max {projection['max_mm']:.3g} mm from the wanted one"
+
+
 _FIGURES: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "target_displacement_mm": ("to move", lambda value: f"{value:.3g} mm"),
+    "target_projection": ("nearest", lambda value: f"the nearest shape that the part can take: {_cost(value)}"),
     "error": ("error", _error_text),
     "smp_fraction": ("SMP", lambda value: f"{100 * value:.1f} % of the volume"),
     "forces": ("forces", lambda value: f"{value} points"),

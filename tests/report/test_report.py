@@ -17,8 +17,16 @@ from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.report import run
 
 FIELDS = [
-    *("verdict", "reasons", "error", "target_displacement_mm", "smp_fraction", "forces", "ambiguous_fraction"),
-    *("isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual", "min_det_F", "element_order"),
+    *("verdict", "reasons", "error", "target_displacement_mm", "target_projection", "smp_fraction", "forces"),
+    *(
+        "ambiguous_fraction",
+        "isolated_fraction",
+        "fixity",
+        "undesired_deformation",
+        "equilibrium_residual",
+        "min_det_F",
+        "element_order",
+    ),
     *("mass_g", "cost_usd", "printing", "tau_s", "wall_s", "peak_rss_mb", "left_out", "stages", "versions", "inputs"),
 ]
 
@@ -30,6 +38,16 @@ def result(inputs, profile):
 
 def page_data(page: bytes) -> dict:
     return json.loads(re.search(rb'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def test_the_cost_of_a_projected_target_is_told_and_part_of_the_error(inputs, profile):
+    mesh, before = inputs["mesh"], run(inputs, profile, SilentMonitor())["report_json"]
+    inputs["mesh"] = mesh | {"X_wanted": mesh["X_temp"] * [1.0, 1.0, 1.2]}
+    inputs["check_report"]["target_projection"] = {"rms_mm": 0.123, "max_mm": 0.5}
+    result = run(inputs, profile, SilentMonitor())
+    assert result["report_json"]["target_projection"] == {"rms_mm": 0.123, "max_mm": 0.5}
+    assert result["report_json"]["error"]["rms_mm"] > before["error"]["rms_mm"]
+    assert b"0.123 mm" in result["report_html"]
 
 
 def test_report_has_the_fields_of_the_contract_verdict_first(result):
