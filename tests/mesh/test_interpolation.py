@@ -103,6 +103,27 @@ def test_a_twist_inverts_no_tet_on_the_way(bar, degrees: float) -> None:
     assert np.linalg.det(deformation_gradients(X, straight, tets)).min() < 0.05
 
 
+@pytest.mark.parametrize("degrees", [400.0, 540.0, -720.0])
+def test_a_twist_of_more_than_a_turn_is_followed_the_long_way(bar, degrees: float) -> None:
+    """Past a whole turn, tets that are tilted a little have no rotation vector near that of their neighbours."""
+    X, tets = bar
+    path = path_to(twisted(X, degrees), bar)
+    np.testing.assert_allclose(path.at(1.0), twisted(X, degrees), atol=1e-12)
+    for t in np.linspace(0, 1, 9)[1:-1]:
+        assert np.linalg.det(deformation_gradients(X, path.at(t), tets)).min() > 0.5
+        expected = Rotation.from_euler("x", t * degrees * (LENGTH - 0.5) / LENGTH, degrees=True)
+        seen = Rotation.from_rotvec(tip_turn(path, t, bar), degrees=True)
+        assert np.degrees((seen * expected.inv()).magnitude()) < 6.0
+
+
+def test_a_bend_with_a_twist_of_more_than_a_turn_is_followed(bar) -> None:
+    X, tets = bar
+    x = bent(twisted(X, 500.0), 200.0)
+    path = path_to(x, bar)
+    for t in np.linspace(0, 1, 9):
+        assert np.linalg.det(deformation_gradients(X, path.at(t), tets)).min() > 0.4
+
+
 def test_a_rigid_motion_is_followed_rigidly(bar) -> None:
     """Also of the anchor, which goes straight: then only the tets that touch it deform."""
     X, tets = bar
