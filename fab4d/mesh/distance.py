@@ -79,14 +79,14 @@ def hausdorff_distance(a: FloatArray, b: FloatArray, faces: IntArray) -> float:
     order = np.argsort(-bound, kind="stable")
     vertices, bound = on_surface[order], bound[order]
     # Triangles that are neighbours in b are neighbours in a: one order makes tight boxes for both.
-    ordered = faces[_spatial_order(b[faces])]
+    ordered = faces[spatial_order(b[faces])]
     one_way = _largest_distance(a[vertices], bound, 0.0, *box_tree(b[ordered]))
     return float(np.sqrt(_largest_distance(b[vertices], bound, one_way, *box_tree(a[ordered]))))
 
 
 def surface_distances(points: FloatArray, b: FloatArray, faces: IntArray) -> FloatArray:
     """Distance (k,) of each point (k, 3) to the surface with vertices b (n, 3) and triangles `faces`, mm."""
-    tree = box_tree(b[faces[_spatial_order(b[faces])]])
+    tree = box_tree(b[faces[spatial_order(b[faces])]])
     return np.sqrt(_distances(np.ascontiguousarray(points, dtype=np.float64), *tree))
 
 
@@ -97,7 +97,7 @@ def largest_surface_distance(points: FloatArray, b: FloatArray, faces: IntArray)
     """
     bound = cKDTree(b[_used(faces)]).query(points)[0] ** 2
     order = np.argsort(-bound, kind="stable")
-    tree = box_tree(b[faces[_spatial_order(b[faces])]])
+    tree = box_tree(b[faces[spatial_order(b[faces])]])
     return float(np.sqrt(_largest_distance(points[order], bound[order], 0.0, *tree)))
 
 
@@ -109,7 +109,7 @@ def box_tree(triangles: FloatArray) -> BoxTree:
     return BoxTree(corners, *_boxes(corners, n_leaves))
 
 
-def _spatial_order(triangles: FloatArray) -> IntArray:
+def spatial_order(triangles: FloatArray) -> IntArray:
     """Order (b,) that visits triangles (b, 3, 3) along a space-filling curve."""
     return np.argsort(_morton_codes(triangles[:, 0] + triangles[:, 1] + triangles[:, 2]), kind="stable")
 

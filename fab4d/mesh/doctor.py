@@ -6,6 +6,7 @@ import numpy as np
 
 from fab4d.mesh.compatibility import has_repeated_vertex
 from fab4d.mesh.findings import Finding, finding, named
+from fab4d.mesh.intersection import MOST_PAIRS, self_intersections
 from fab4d.mesh.measures import bounding_box_diagonal, tet_volumes
 from fab4d.mesh.quality import (
     coincident_vertices,
@@ -254,8 +255,31 @@ def _non_manifold(pair: Pair, faces: IntArray) -> list[Finding]:
     return findings
 
 
+# 10. Self-intersection.
+
+
+def check_crossings(pair: Pair, x: FloatArray, file: str, severity: str, advice: str) -> list[Finding]:
+    """Whether the surface of the shape x (n, 3) passes through itself."""
+    faces = face_table(pair.tets).boundary
+    pairs = self_intersections(x, faces)
+    if not len(pairs):
+        return []
+    first, second = faces[pairs[0]]
+    place = ", ".join(f"{c:.4g}" for c in x[first].mean(axis=0))
+    some = np.unique(faces[pairs])
+    message = (
+        f"the surface passes through itself ({len(pairs)}{' or more' if len(pairs) == MOST_PAIRS else ''} pairs of "
+        f"triangles, one of vertices {pair.vertex_map[first].tolist()} and {pair.vertex_map[second].tolist()} near "
+        f"({place}) mm): {advice}"
+    )
+    return [finding("self-intersection", severity, file, message, pair.vertex_map[some])]
+
+
 def _pieces(pair: Pair) -> list[Finding]:
-    """A part is printed as one body, and tets that share no face are not printed as one."""
+    """A part is printed as one body, and tets that share no face are not printed as one.
+
+    Clamps do not help: once unloaded, pieces have no place relative to each other that could be right or wrong.
+    """
     piece = component_labels(len(pair.tets), face_table(pair.tets).interior_tets)
     n_pieces = int(piece.max()) + 1
     if n_pieces == 1:
@@ -265,8 +289,8 @@ def _pieces(pair: Pair) -> list[Finding]:
     vertices = pair.vertex_map[np.unique(pair.tets[piece == smallest])]
     message = (
         f"the part is in {n_pieces} pieces that share no face, the smallest ({volumes[smallest]:.3g} mm^3) that of "
-        f"{named('vertex', vertices)}: it must be one body; join or remove pieces, and merge coincident vertices if "
-        "the exporter did not"
+        f"{named('vertex', vertices)}: it must be one body; join the pieces, merge coincident vertices if the "
+        "exporter did not, or make a scene of each piece"
     )
     return [finding("pieces", "error", pair.files[0], message, vertices)]
 

@@ -16,6 +16,7 @@ from fab4d.mesh.doctor import (
     COINCIDENT,
     Pair,
     check_boundary,
+    check_crossings,
     check_mirror,
     check_motion,
     check_tets,
@@ -67,6 +68,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         monitor.progress("target")
         target = reachable_target(pair, clamp, profile["materials"], _tolerance(profile["goal"], pair))
         findings += [*_refuse(target.findings), *_strong_deformation(target.pair, profile["materials"])]
+    monitor.progress("self-intersection")
+    findings += _refuse(_self_intersections(target.pair, nothing_to_program))
     report = _report(target, clamp, findings, nothing_to_program)
     return {"mesh": _arrays(target, clamp), "check_report": report}
 
@@ -77,6 +80,16 @@ _STEPS: Mapping[str, Step] = {
     "tets": check_tets,
     "mirror image": check_mirror,
 }
+
+
+def _self_intersections(pair: Pair, nothing_to_program: bool) -> list[Finding]:
+    printed = check_crossings(
+        pair, pair.X, pair.files[0], "error", "such a part cannot be printed; move these places apart"
+    )
+    if nothing_to_program or printed:
+        return printed
+    advice = "the part would have to pass through itself, and nothing here keeps it from doing so; move them apart"
+    return check_crossings(pair, pair.X_temp, pair.files[1], "warning", advice)
 
 
 def _tolerance(goal: Goal, pair: Pair) -> float:
@@ -366,7 +379,6 @@ def _statistics(pair: Pair, clamp: BoolArray) -> dict[str, float | int]:
 def _left_out(target: Target, clamp: BoolArray, nothing_to_program: bool) -> list[dict[str, str]]:
     left_out = [
         {"what": "gravity", "why": "the scene has none"},
-        {"what": "self-intersection of the temporary shape", "why": "not checked: look at the shape before printing"},
     ]
     if not clamp.any():
         left_out.append({"what": "clamp", "why": "the scene has none: the forces balance each other"})

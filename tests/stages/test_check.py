@@ -542,6 +542,31 @@ def test_a_surface_that_touches_itself_is_refused_along_edges_and_told_at_vertic
     assert x[vertex].tolist() == [5, 5, 10]
 
 
+def curled(radius: float, degrees: float) -> np.ndarray:
+    """A bar of 30 mm as an arc in the x-z plane; its first cells stay."""
+    x, _ = grid(12, 2, 2, size=2.5)
+    angle = np.radians(degrees) * x[:, 0] / 30
+    arm = radius + x[:, 2]
+    return np.column_stack([arm * np.sin(angle), x[:, 1], arm * np.cos(angle) - radius])
+
+
+def test_a_temporary_shape_that_passes_through_itself_is_told() -> None:
+    x, tets = grid(12, 2, 2, size=2.5)
+    _, report = check_points(x, curled(5, 330), tets)
+    assert "self-intersection" not in codes(report)
+    _, report = check_points(x, curled(5, 400), tets)
+    found = codes(report)["self-intersection"]
+    assert (found["severity"], found["file"]) == ("warning", "temp.vtu")
+    # Its last cells are in its first ones.
+    assert x[found["indices"], 0].min() < 6
+
+
+def test_a_permanent_shape_that_passes_through_itself_is_refused() -> None:
+    _, tets = grid(12, 2, 2, size=2.5)
+    with pytest.raises(MeshError, match=r"perm\.vtu: the surface passes through itself .*vertices \[.* mm\)"):
+        check_points(curled(5, 400), curled(5, 330), tets)
+
+
 def test_a_part_one_tet_thick_is_told() -> None:
     x, tets = grid(6, 2, 1)
     _, report = check_points(x, bent(x), tets)
