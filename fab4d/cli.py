@@ -31,6 +31,7 @@ STAGE_HELP = {
     "threshold": "Round the material to SMP and TPE and clean it up.",
     "refit": "Fit the held positions to the rounded material.",
     "verify": "Simulate the rounded design anew, from the permanent shape.",
+    "sensitivity": "Tell whether the state is stable and what must be done carefully.",
     "bodies": "Write the watertight bodies to print.",
     "slice": "Slice the bodies and compare.",
     "rig": "Write the sheet to stand at the rig with.",
@@ -214,7 +215,7 @@ def _checked(job: "Job") -> "Workspace":
     return job.workspace
 
 
-for _stage in stage_table().between("solve", "verify"):
+for _stage in stage_table().between("solve", "sensitivity"):
     _stage_command(_stage.name)
 
 

@@ -12,6 +12,7 @@ from fab4d.design.problem import Problem
 from fab4d.design.turning import Turning
 from fab4d.elasticity import _kernels as kernels
 from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern, build_pattern, dirichlet_mask
+from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.solvers.linear import Analysis, Factor, analyse
 from fab4d.solvers.newton import Residual, Solution, newton
@@ -138,6 +139,12 @@ class Equilibria:
         for name in ("free_pattern", "free_analysis", "_free_masks", "block_structure", "free_turning"):
             if name in self.__dict__:
                 other.__dict__[name] = self.__dict__[name]
+        return other
+
+    def with_moduli(self, **phases: Moduli) -> "Equilibria":
+        """The same with other moduli (`Problem.with_moduli`); all patterns are kept."""
+        other = Equilibria(self.problem.with_moduli(**phases), self.patches)
+        other.__dict__.update({name: self.__dict__[name] for name in set(self.__dict__) - set(other.__dict__)})
         return other
 
     @cached_property

@@ -1,6 +1,6 @@
 """The design problem in dimensionless form: lengths in L0, stresses in mu_TPE, forces in mu_TPE L0^2."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,6 +49,12 @@ class Problem:
         """(m,) V_j / V."""
         volumes = self.body.volumes
         return volumes / volumes.sum()
+
+    def with_moduli(
+        self, tpe: Moduli | None = None, rubbery: Moduli | None = None, glassy: Moduli | None = None
+    ) -> "Problem":
+        """The same problem with other moduli, in the same unit, of the phases that are given."""
+        return replace(self, tpe=tpe or self.tpe, rubbery=rubbery or self.rubbery, glassy=glassy or self.glassy)
 
 
 def _scaled(moduli: Moduli, unit: float) -> Moduli:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import face_table
+from fab4d.report.careful import Deviation, deviations, is_measured, warnings
 from fab4d.report.metrics import Shapes, final_as_wanted
 from fab4d.report.verdict import ACCEPTED, Check
 from fab4d.report.wording import plain
@@ -36,6 +37,7 @@ def report_page(
         checks=_checks(checks),
         plot=_image(plot),
         forces=_forces(scene["points"]),
+        careful=_careful(report["sensitivity"]),
         stages=_stages(report),
         left_out=_bullets(f"{item['what']}: {item['why']}" for item in report["left_out"]),
         origin=_origin(report),
@@ -156,6 +158,28 @@ def _forces(points: Sequence[Mapping[str, Any]]) -> str:
     )
     head = '<tr><th>no</th><th class="number">N</th><th>direction</th><th>held at, mm</th></tr>'
     return f"<table>{head}{rows}</table><p>All that the bench needs is in rig/rig-sheet.pdf and rig/forces.csv.</p>"
+
+
+def _careful(sensitivity: Mapping[str, Any] | None) -> str:
+    if not is_measured(sensitivity):
+        return f"{_warnings(sensitivity)}<p>How the error moves was not measured: see what is left out.</p>"
+    designed = Deviation("nothing: all as designed", sensitivity["rms_mm"])
+    rows = "".join(_deviation(d) for kind in [[designed], *deviations(sensitivity)] for d in kind)
+    head = '<tr><th>what is off</th><th class="number">RMS error, mm</th><th class="number">by the model</th></tr>'
+    note = (
+        "RMS error of the finished shape with the equilibria solved anew; the model is of second order in the held "
+        "positions about the designed ones, and stands in for all pads but the worst two and for random directions."
+    )
+    return f"{_warnings(sensitivity)}<table>{head}{rows}</table><p>{note}</p>"
+
+
+def _warnings(sensitivity: Mapping[str, Any] | None) -> str:
+    return "".join(f'<p class="warning">{escape(words)}</p>' for words in warnings(sensitivity))
+
+
+def _deviation(d: Deviation) -> str:
+    model = "" if d.model is None else plain(d.model)
+    return f'<tr><td>{escape(d.what)}</td><td class="number">{d.words}</td><td class="number">{model}</td></tr>'
 
 
 def _triple(vector: Sequence[float], decimals: int) -> str:

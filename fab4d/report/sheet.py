@@ -1,7 +1,9 @@
 """The rig sheet as a PDF: page 1 is enough at the bench, page 2 has the large views and what to know."""
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from reportlab.lib.colors import Color, black, grey
@@ -10,6 +12,7 @@ from reportlab.lib.units import mm
 from reportlab.lib.utils import simpleSplit
 from reportlab.pdfgen.canvas import Canvas
 
+from fab4d.report.careful import is_measured, point_errors, warnings, worst_deviations
 from fab4d.report.drawing import RED, VIEW_MARGIN, draw_view
 from fab4d.report.views import FRAMES, Figure, fitted
 from fab4d.report.wording import kelvin, number, printable, significant, triple
@@ -25,6 +28,8 @@ TITLE_WIDTH = 56.0
 """Of a view, mm of paper."""
 FOOT = 12.0
 """Height kept free at the foot of a page for the boxes to sign, mm."""
+MOST_DEVIATIONS = 4
+"""Of those that need care, on the sheet."""
 
 
 @dataclass
@@ -62,30 +67,47 @@ class Page:
             self.y -= 0.46 * size
             self.text(x, line, size)
 
+    def alert(self, words: str, size: float = 9.0) -> None:
+        """Wrapped bold red lines below `y`."""
+        for line in simpleSplit(printable(words), "Helvetica-Bold", size, FULL * mm):
+            self.y -= 0.51 * size
+            self.text(MARGIN, line, size, bold=True, colour=RED)
 
-def rig_sheet(name: str, plan: RigPlan, figure: Figure, reasons: list[str]) -> bytes:
+
+def rig_sheet(
+    name: str, plan: RigPlan, figure: Figure, reasons: list[str], sensitivity: Mapping[str, Any] | None = None
+) -> bytes:
     """The sheet of part `name`. Equal plans give equal bytes.
 
     figure : the part to draw       reasons : why the rig cannot do it, empty when it can
+    sensitivity : sensitivity_report
     """
     buffer = io.BytesIO()
     canvas = Canvas(buffer, pagesize=A4, invariant=1, pageCompression=1)
     canvas.setTitle(printable(f"Rig sheet: {name}"))
-    _bench_page(canvas, name, plan, figure, reasons)
+    _bench_page(canvas, name, plan, figure, reasons, sensitivity)
     _drawing_page(canvas, name, plan, figure)
     canvas.save()
     return buffer.getvalue()
 
 
-def _bench_page(canvas: Canvas, name: str, plan: RigPlan, figure: Figure, reasons: list[str]) -> None:
+def _bench_page(
+    canvas: Canvas,
+    name: str,
+    plan: RigPlan,
+    figure: Figure,
+    reasons: list[str],
+    sensitivity: Mapping[str, Any] | None,
+) -> None:
     page = Page(canvas, HEIGHT - MARGIN - 4)
     _title(page, f"Rig sheet: {name}", "mm, N; frame of the printed part (that of the STL and 3MF files)")
-    for reason in reasons:
-        page.y -= 4.6
-        page.text(MARGIN, f"NOT POSSIBLE ON THIS RIG: {reason}", 9, bold=True, colour=RED)
+    alerts = [f"NOT POSSIBLE ON THIS RIG: {reason}" for reason in reasons] + warnings(sensitivity)
+    for words in alerts:
+        page.alert(words)
     page.y -= 2
-    _views_in_a_row(page, plan, figure, max(68.0, 100.0 - 4.0 * max(0, plan.points.count + len(reasons) - 8)))
-    _point_table(page, plan)
+    _views_in_a_row(page, plan, figure, max(60.0, 92.0 - 4.0 * max(0, plan.points.count + len(alerts) - 8)))
+    _point_table(page, plan, sensitivity)
+    _careful_table(page, sensitivity)
     _clamp_lines(page, plan)
     _schedule_lines(page, plan)
     _check_table(page, plan)
@@ -191,7 +213,7 @@ def _table(page: Page, columns: list[tuple[str, float, str]], rows: list[list[st
     page.y -= 1.2
 
 
-def _point_table(page: Page, plan: RigPlan) -> None:
+def _point_table(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | None) -> None:
     page.heading(
         "Points: move each pad to its hold position and lock it there; the forces are what a gauge should show"
     )
@@ -205,8 +227,9 @@ def _point_table(page: Page, plan: RigPlan) -> None:
         ("Azim / elev", 20.0, "l"),
         ("N", 14.0, "r"),
         ("kgf", 12.0, "r"),
-        ("g*", 14.0, "r"),
+        ("1 mm off*", 14.0, "r"),
     ]
+    off = [significant(e) for e in point_errors(sensitivity)] if is_measured(sensitivity) else [""] * p.count
     rows = [
         [
             str(k + 1),
@@ -217,16 +240,26 @@ def _point_table(page: Page, plan: RigPlan) -> None:
             f"{number(p.azimuth[k], 0)}° / {number(p.elevation[k], 0)}°",
             significant(p.size[k]),
             significant(p.kgf[k]),
-            number(1e3 * p.kgf[k], 0),
+            off[k],
         ]
         for k in range(p.count)
     ]
     _table(page, columns, rows)
     page.paragraph(
-        "* mass over a pulley that pulls as hard, to check a gauge. Azimuth from +x to +y, elevation above xy. "
+        "Azimuth from +x to +y, elevation above xy. * RMS error of the finished shape, mm, when this pad alone is 1 mm "
+        "off in its worst direction. "
         f"True forces: probably {number(100 * plan.trust.least_fraction, 0)} % to 100 % of these, so go by position.",
         size=6.5,
     )
+
+
+def _careful_table(page: Page, sensitivity: Mapping[str, Any] | None) -> None:
+    if not is_measured(sensitivity):
+        return
+    page.heading("What must be done carefully")
+    worst = worst_deviations(sensitivity)[:MOST_DEVIATIONS]
+    rows = [["nothing: all as designed", significant(sensitivity["rms_mm"])], *([d.what, d.words] for d in worst)]
+    _table(page, [("What is off", 100.0, "l"), ("RMS error of the finished shape, mm", 50.0, "r")], rows)
 
 
 def _clamp_lines(page: Page, plan: RigPlan) -> None:

@@ -25,6 +25,7 @@ STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
     "threshold": (0.0688, 0.59),
     "refit": (1.96, 0.71),
     "verify": (0.86, 0.89),
+    "sensitivity": (0.6, 0.9),
     "bodies": (0.13, 0.46),
     "slice": (1.15, 0.61),
     "rig": (0.535, 0.04),

@@ -28,6 +28,7 @@ REPORTS = (
     "threshold_report",
     "refit_report",
     "verify_report",
+    "sensitivity_report",
     "bodies_report",
     "slice_report",
     "rig_report",
@@ -44,7 +45,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     checks = checks_of(figures, limits)
     reasons = reasons_of(checks, reports)
     verdict = REJECTED if reasons else ACCEPTED
-    report = {"verdict": verdict, "reasons": reasons} | figures | {"printing": _printing(reports)}
+    report = {"verdict": verdict, "reasons": reasons} | figures
+    report |= {"sensitivity": _sensitivity(reports["sensitivity_report"]), "printing": _printing(reports)}
     report |= _origin(inputs, reports)
     monitor.progress("page", rms_mm=figures["error"]["rms_mm"])
     rows = joined_trace({s: inputs[f"{s}_trace"] for s in ("solve", "refit")}, inputs["run"]["stages"], report["tau_s"])
@@ -99,6 +101,12 @@ def _figures(
         "mass_g": mass,
         "cost_usd": cost,
     }
+
+
+def _sensitivity(report: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """The sensitivity report but for what is told with those of other stages; None where it was left out."""
+    kept = {key: value for key, value in (report or {}).items() if key not in ("reasons", "left_out")}
+    return kept or None
 
 
 def _printing(reports: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     reasons = limit_reasons(plan.points, rig.max_force, rig.max_points, rig.pull_only)
     monitor.progress("sheet", forces=plan.points.count)
     return {
-        "rig_sheet": rig_sheet(profile["name"], plan, _figure(state, inputs["labels"]), reasons),
+        "rig_sheet": rig_sheet(
+            profile["name"], plan, _figure(state, inputs["labels"]), reasons, inputs["sensitivity_report"]
+        ),
         "forces_csv": csv_bytes(FORCE_COLUMNS, force_rows(plan.points, inputs["mesh"]["vertex_map"])),
         "rig_report": plan_summary(plan, reasons),
     }

@@ -23,6 +23,39 @@ def bar() -> ModuleType:
     return module
 
 
+def sensitivity_report() -> dict[str, Any]:
+    """Three pads; set by force, no shape is found with smaller ones."""
+    both = {"softer": {"rms_mm": 0.2, "forces": 0.97}, "stiffer": {"rms_mm": 0.3, "forces": 1.1}}
+    pads = [(0.5, None), (0.9, 0.8), (0.7, 0.75)]
+    return {
+        "stable": True,
+        "instability": {"held": 0, "final": 0, "dead_loads": 2, "points": []},
+        "rms_mm": 0.15,
+        "hold": {
+            "change_mm": 1.0,
+            "random_rms_mm": 1.25,
+            "points": [
+                {"point": k, "direction": [0.0, -0.6, 0.8], "model_rms_mm": model, "rms_mm": rms}
+                for k, (model, rms) in enumerate(pads, 1)
+            ],
+        },
+        "force": {
+            "change": 0.05,
+            "smaller": {"model_rms_mm": 0.6, "model_travel_mm": 7.0, "rms_mm": None},
+            "larger": {"model_rms_mm": 0.65, "model_travel_mm": 7.0, "rms_mm": 2.5},
+            "points": [{"point": k, "model_rms_mm": 0.4, "model_travel_mm": 1.0} for k in (1, 2, 3)],
+        },
+        "modulus": {"change": 0.1, "tpe": both, "rubbery": both, "glassy": both},
+        "reasons": [],
+        "left_out": [],
+    }
+
+
+@pytest.fixture
+def sensitivity() -> dict[str, Any]:
+    return sensitivity_report()
+
+
 def trace(solver: str, phases: list[str], n: int) -> bytes:
     rows = [
         {
@@ -76,6 +109,7 @@ def inputs(bar: ModuleType) -> dict[str, Any]:
             "reached": True,
             "reasons": [],
         },
+        "sensitivity_report": sensitivity_report(),
         "bodies_report": None,
         "slice_report": None,
         "rig_report": {"points": 3, "reasons": [], "left_out": []},

@@ -18,16 +18,9 @@ from fab4d.stages.report import run
 
 FIELDS = [
     *("verdict", "reasons", "error", "target_displacement_mm", "target_projection", "smp_fraction", "forces"),
-    *(
-        "ambiguous_fraction",
-        "isolated_fraction",
-        "fixity",
-        "undesired_deformation",
-        "equilibrium_residual",
-        "min_det_F",
-        "element_order",
-    ),
-    *("mass_g", "cost_usd", "printing", "tau_s", "wall_s", "peak_rss_mb", "left_out", "stages", "versions", "inputs"),
+    *("ambiguous_fraction", "isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual"),
+    *("min_det_F", "element_order", "mass_g", "cost_usd", "sensitivity", "printing", "tau_s", "wall_s"),
+    *("peak_rss_mb", "left_out", "stages", "versions", "inputs"),
 ]
 
 
@@ -81,6 +74,31 @@ def test_printing_warns_without_rejecting(inputs, profile):
     assert printing["checks"][0]["check"] == "walls"
     row = "<td>walls</td><td>0.25 of it at (1, 2, 3) mm</td><td>at most 0.001 of it</td><td>warns</td>"
     assert row in result["report_html"].decode()
+
+
+def test_sensitivity_is_told_on_the_page(result, sensitivity):
+    told = result["report_json"]["sensitivity"]
+    assert told == {key: value for key, value in sensitivity.items() if key not in ("reasons", "left_out")}
+    page = result["report_html"].decode()
+    assert '<p class="warning">HOLD POSITIONS, DO NOT HANG WEIGHTS' in page
+    for what, rms, model in (
+        ("pads set by force gauge, all forces 5 % smaller", "no such shape", "0.6"),
+        ("pad 1 alone 1 mm off, towards (0.00 -0.60 0.80)", "0.500", "0.5"),
+        ("pad 2 alone 1 mm off, towards (0.00 -0.60 0.80)", "0.800", "0.9"),
+        ("hot SMP 10 % stiffer than its card says (forces 10 % larger)", "0.300", ""),
+    ):
+        row = f'<td>{what}</td><td class="number">{rms}</td><td class="number">{model}</td>'
+        assert row in page
+
+
+def test_an_unstable_design_is_rejected(inputs, profile):
+    why = "the held median shape is unstable in 2 ways"
+    inputs["sensitivity_report"] = {"stable": False, "reasons": [why], "left_out": [{"what": "s", "why": "unstable"}]}
+    result = run(inputs, profile, SilentMonitor())
+    assert result["report_json"]["verdict"] == "REJECTED"
+    assert result["report_json"]["reasons"] == [why]
+    assert result["report_json"]["sensitivity"] == {"stable": False}
+    assert b"UNSTABLE" in result["report_html"]
 
 
 def test_default_tolerance_is_a_part_of_the_diagonal(inputs, profile, bar):
@@ -160,6 +178,7 @@ def test_names_cannot_break_the_page(inputs, profile):
 def test_nothing_to_program_is_reported(inputs, profile):
     inputs["mesh"]["X_temp"] = inputs["mesh"]["X"]
     nothing = ("relaxed", "solve_report", "solve_trace", "labels", "threshold_report", "refit_report", "refit_trace")
+    inputs["sensitivity_report"] = {"reasons": [], "left_out": [{"what": "sensitivity", "why": "no point"}]}
     inputs |= dict.fromkeys((*nothing, "state", "verify_report", "bodies_report"))
     inputs["rig_report"] = {
         "points": 0,
@@ -172,6 +191,7 @@ def test_nothing_to_program_is_reported(inputs, profile):
     assert (report["verdict"], report["forces"], report["smp_fraction"]) == ("ACCEPTED", 0, 0.0)
     assert report["error"]["rms_mm"] < 1e-12
     assert report["fixity"] is None
+    assert report["sensitivity"] is None
     assert result["error_vs_time"] is None
     assert result["design_vtu"].startswith(b"<?xml")
     assert b"Nothing was solved" in result["report_html"]

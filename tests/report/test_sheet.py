@@ -21,8 +21,9 @@ from fab4d.stages.rig import run
 
 @pytest.fixture
 def rig_run(bar, profile):
-    def go(state, name="bent-bar"):
+    def go(state, name="bent-bar", sensitivity=None):
         inputs = {"mesh": bar.mesh_artifact(), "labels": bar.labels_artifact(), "state": state}
+        inputs["sensitivity_report"] = sensitivity or {"left_out": [], "reasons": []}
         return run(inputs, profile | {"name": name}, SilentMonitor())
 
     return go
@@ -135,6 +136,30 @@ def test_equal_states_give_equal_bytes(bar, rig_run):
     assert first["forces_csv"] == second["forces_csv"]
     other = bar.state_artifact(forces=np.ones((3, 3)))
     assert rig_run(other)["rig_sheet"] != first["rig_sheet"]
+
+
+def test_sheet_says_what_must_be_done_carefully(bar, rig_run, sensitivity):
+    text = pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"])
+    assert "HOLD POSITIONS, DO NOT HANG WEIGHTS" in text
+    lines = text.splitlines()
+    start = lines.index("What must be done carefully")
+    off = ["all forces 5 % smaller", "every pad 1 mm off", "pad 2 alone 1 mm off", "TPE 10 % stiffer"]
+    assert [line for line in lines[start + 3 : start + 13 : 2] if line][1:] == [
+        next(line for line in lines if words in line) for words in off
+    ]
+    assert lines[start + 4 : start + 13 : 2] == ["0.150", "no such shape", "1.25", "0.800", "0.300"]
+    for error in ("0.500", "0.800", "0.750"):
+        assert error in lines[:start]
+
+
+def test_sheet_without_sensitivity_has_no_care_and_no_warning(bar, rig_run, sensitivity):
+    plain = pdf_text(rig_run(bar.state_artifact())["rig_sheet"])
+    assert "What must be done carefully" not in plain
+    assert "DO NOT HANG WEIGHTS" not in plain
+    sensitivity["instability"]["dead_loads"] = 0
+    assert "DO NOT HANG WEIGHTS" not in pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"])
+    unstable = {"stable": False, "left_out": [], "reasons": ["it snaps"]}
+    assert "UNSTABLE" in pdf_text(rig_run(bar.state_artifact(), sensitivity=unstable)["rig_sheet"])
 
 
 def test_nothing_to_program_gives_no_sheet(bar, rig_run):

@@ -1,0 +1,174 @@
+"""Stage `sensitivity`: whether the verified state is stable, and how its error moves with rig and material."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
+from fab4d.design.gauss_newton import Design
+from fab4d.design.objective import shape_error
+from fab4d.design.robustness import (
+    PHASES,
+    Instability,
+    Response,
+    instability_of,
+    response_of,
+    with_moved_points,
+    with_scaled_forces,
+    with_scaled_modulus,
+)
+from fab4d.solvers.linear import SingularMatrixError
+from fab4d.stages._design import patches_of, problem_of
+from fab4d.stages.monitor import Monitor
+
+HOLD_MM, FORCE_CHANGE, MODULUS_CHANGE = 1.0, 0.05, 0.1
+# Points whose worst move is simulated; for the others a quadratic model of the error tells it.
+SIMULATED_POINTS = 2
+ELEMENTS = {1: "linear", 2: "quadratic"}
+
+
+def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
+    """Count the ways in which the state moves away by itself; change positions, forces and moduli and solve again."""
+    why = _why_not(inputs["state"], inputs["verify_report"])
+    if why:
+        return {"sensitivity_report": _left_out(why)}
+    state, order = inputs["state"], inputs["verify_report"]["element_order"]
+    problem = problem_of(inputs["mesh"], profile["materials"], ELEMENTS[order])
+    equilibria = Equilibria(problem, patches_of(problem, state))
+    design = _verified_design(equilibria, inputs["labels"]["smp"].astype(np.float64), state)
+    monitor.progress("stability")
+    try:
+        response = response_of(equilibria, design)
+    except SingularMatrixError as error:
+        reason = f"the verified state is at the limit of its stability ({error}): allow more points ([goal] max_forces)"
+        left_out = _left_out("the state has no stiffness in some direction")
+        return {"sensitivity_report": left_out | {"stable": False, "reasons": [reason]}}
+    unstable = instability_of(response)
+    reasons = _reasons(unstable)
+    report = {"stable": not reasons, "instability": _instability_figures(unstable), "reasons": reasons}
+    if reasons:
+        return {"sensitivity_report": _left_out("the state is not stable") | report}
+    return {"sensitivity_report": report | _changes(equilibria, design, response, monitor) | {"left_out": []}}
+
+
+def _why_not(state: Mapping[str, Any], verify_report: Mapping[str, Any]) -> str | None:
+    if not len(state["patch_center"]):
+        return "no point carries a force: there is nothing to program"
+    return None if verify_report["reached"] else "the simulation did not reach the designed state"
+
+
+def _left_out(why: str) -> dict[str, Any]:
+    what = "sensitivity to positions, forces and moduli"
+    return {"left_out": [{"what": what, "why": why}], "reasons": []}
+
+
+def _verified_design(equilibria: Equilibria, smp: np.ndarray, state: Mapping[str, np.ndarray]) -> Design:
+    """The state artifact as a design; it is in equilibrium already, so Newton has next to nothing to do."""
+    L0, force = equilibria.problem.length, equilibria.problem.force
+    x, forces = state["x"] / L0, state["patch_force"] / force
+    held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
+    median = equilibria.solve_median(smp, held, x, forces)
+    return Design(smp, median, equilibria.solve_final(smp, median, state["y"] / L0))
+
+
+# -- stability
+
+
+def _reasons(unstable: Instability) -> list[str]:
+    """Why the delivered state would not stay where it is."""
+    states = (("held median shape", unstable.held), ("unloaded final shape", unstable.final))
+    return [
+        f"the {name} is unstable in {count} ways: the part would not stay in it; allow more points ([goal] max_forces)"
+        for name, count in states
+        if count
+    ]
+
+
+def _instability_figures(unstable: Instability) -> dict[str, Any]:
+    return {
+        "held": unstable.held,
+        "final": unstable.final,
+        "dead_loads": unstable.dead_loads,
+        "points": (np.flatnonzero(unstable.points) + 1).tolist(),
+    }
+
+
+# -- changes
+
+
+def _changes(equilibria: Equilibria, design: Design, response: Response, monitor: Monitor) -> dict[str, Any]:
+    L0 = equilibria.problem.length
+    monitor.progress("positions", rms_mm=response.rms * L0)
+    hold = _hold_figures(equilibria, design, response)
+    monitor.progress("forces", rms_mm=response.rms * L0)
+    force = _force_figures(equilibria, design, response)
+    monitor.progress("moduli", rms_mm=response.rms * L0)
+    return {"rms_mm": response.rms * L0, "hold": hold, "force": force, "modulus": _modulus_figures(equilibria, design)}
+
+
+def _rms_mm(equilibria: Equilibria, design: Design | None) -> float | None:
+    """RMS error of a changed design; None where there is none."""
+    if design is None:
+        return None
+    return shape_error(equilibria.problem, design.final.y).rms * equilibria.problem.length
+
+
+def _hold_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
+    """Each point moved in its own worst direction; all points in random ones."""
+    L0, count = equilibria.problem.length, equilibria.patches.count
+    moves = [_alone(count, point, response.worst_move(point, HOLD_MM / L0)) for point in range(count)]
+    expected = [response.rms_after(dc) * L0 for dc in moves]
+    simulated: list[float | None] = [None] * count
+    for point in np.argsort(expected)[::-1][:SIMULATED_POINTS]:
+        simulated[point] = _rms_mm(equilibria, with_moved_points(equilibria, design, response, moves[point]))
+    points = [
+        {"point": k + 1, "direction": (dc[k] * L0 / HOLD_MM).tolist(), "model_rms_mm": by_model, "rms_mm": found}
+        for k, (dc, by_model, found) in enumerate(zip(moves, expected, simulated, strict=True))
+    ]
+    return {"change_mm": HOLD_MM, "random_rms_mm": response.expected_rms(HOLD_MM / L0) * L0, "points": points}
+
+
+def _alone(count: int, point: int, change: np.ndarray) -> np.ndarray:
+    """(K, 3) zero but for one point."""
+    all_points = np.zeros((count, 3))
+    all_points[point] = change
+    return all_points
+
+
+def _force_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
+    """All forces larger or smaller by the same part, simulated, and the force of each point alone, by the model."""
+
+    def together(change: float) -> dict[str, float | None]:
+        simulated = _rms_mm(equilibria, with_scaled_forces(equilibria, design, 1 + change))
+        return {**_by_model(response, change * design.median.forces, L0), "rms_mm": simulated}
+
+    def alone(point: int) -> dict[str, float]:
+        force = _alone(equilibria.patches.count, point, FORCE_CHANGE * design.median.forces[point])
+        return max((_by_model(response, sign * force, L0) for sign in (-1, 1)), key=lambda c: c["model_rms_mm"])
+
+    L0 = equilibria.problem.length
+    points = [{"point": k + 1, **alone(k)} for k in range(equilibria.patches.count)]
+    both = {"smaller": together(-FORCE_CHANGE), "larger": together(FORCE_CHANGE)}
+    return {"change": FORCE_CHANGE, **both, "points": points}
+
+
+def _by_model(response: Response, change: np.ndarray, L0: float) -> dict[str, float]:
+    """Error and largest move of a point, mm, when the forces change by `change` (K, 3); moves to first order."""
+    dc = response.moves_for_forces(change)
+    travel = float(np.linalg.norm(dc, axis=1).max())
+    return {"model_rms_mm": response.rms_after(dc) * L0, "model_travel_mm": travel * L0}
+
+
+def _modulus_figures(equilibria: Equilibria, design: Design) -> dict[str, Any]:
+    """Each phase softer and stiffer at the same held positions: error, and size of all forces relative to before."""
+    before = np.linalg.norm(design.median.forces)
+
+    def changed(phase: str, factor: float) -> dict[str, float | None]:
+        found = with_scaled_modulus(equilibria, design, phase, factor)
+        forces = None if found is None else float(np.linalg.norm(found.median.forces) / before)
+        return {"rms_mm": _rms_mm(equilibria, found), "forces": forces}
+
+    signs = (("softer", -1), ("stiffer", 1))
+    phases = {p: {name: changed(p, 1 + sign * MODULUS_CHANGE) for name, sign in signs} for p in PHASES}
+    return {"change": MODULUS_CHANGE} | phases
