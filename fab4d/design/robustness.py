@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fab4d.design.equilibria import Equilibria, Median
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate, held_positions
 from fab4d.design.objective import shape_error, shape_metric
 from fab4d.design.sensitivity import linearise
+from fab4d.design.turning import Turning
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
@@ -17,7 +18,9 @@ NEWTON_STEPS = 25
 NO_STIFFNESS = 1e-9
 # Forces that differ by this part of their size count as equal.
 FORCE_TOLERANCE = 1e-4
-MOST_FORCE_STEPS, SMALLEST_DAMPING = 15, 0.05
+MOST_FORCE_STEPS, SMALLEST_DAMPING = 10, 0.05
+# In how many parts a change of the forces is made, the second time because the first one failed.
+FORCE_PARTS = 1, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,17 +152,33 @@ def with_scaled_modulus(equilibria: Equilibria, design: Design, phase: str, fact
 
 
 def with_scaled_forces(equilibria: Equilibria, design: Design, factor: float) -> Design | None:
-    """The design with `factor` times its forces; None where no such equilibrium is found.
+    """The design with `factor` times its forces; None where no path of equilibria leads there."""
+    problem = equilibria.problem
+    turning = Turning(problem.body, np.flatnonzero(problem.clamp), equilibria.operator[:0])
+    for parts in FORCE_PARTS:
+        median: Median | None = design.median
+        for share in np.linspace(0, 1, parts + 1)[1:]:
+            wanted = (1 + share * (factor - 1)) * design.median.forces
+            median = _median_of_forces(equilibria, turning, design.rho, median, wanted) if median else None
+        if median is not None:
+            return _unloaded(equilibria, design, median)
+    return None
+
+
+def _median_of_forces(
+    equilibria: Equilibria, turning: Turning, rho: FloatArray, median: Median, wanted: FloatArray
+) -> Median | None:
+    """The median shape near another one that the wanted forces (K, 3) hold; None where it is not found.
 
     The points stay locked while it is sought, for under the forces themselves the shape need not be stable. Damped
     Newton steps on the held positions; what is left is measured as moves of the points, for as forces stiff directions
     would hide the soft ones (natural monotonicity test: Deuflhard, Newton Methods for Nonlinear Problems, 3.3).
     """
-    median, wanted, damping = design.median, factor * design.median.forces, 1.0
+    damping = 1.0
     for _ in range(MOST_FORCE_STEPS):
         if np.linalg.norm(wanted - median.forces) <= FORCE_TOLERANCE * np.linalg.norm(wanted):
-            return _unloaded(equilibria, design, median)
-        step = _step_to_forces(equilibria, design.rho, median, wanted, damping)
+            return median
+        step = _step_to_forces(equilibria, turning, rho, median, wanted, damping)
         if step is None:
             return None
         median, damping = step
@@ -167,7 +186,7 @@ def with_scaled_forces(equilibria: Equilibria, design: Design, factor: float) ->
 
 
 def _step_to_forces(
-    equilibria: Equilibria, rho: FloatArray, median: Median, wanted: FloatArray, damping: float
+    equilibria: Equilibria, turning: Turning, rho: FloatArray, median: Median, wanted: FloatArray, damping: float
 ) -> tuple[Median, float] | None:
     """The median shape after a damped Newton step to the wanted forces (K, 3), and the damping of the next step."""
     n = median.x.size
@@ -176,8 +195,9 @@ def _step_to_forces(
     size = float(np.linalg.norm(dc))
     while damping >= SMALLEST_DAMPING:
         dz = columns @ (damping * dc.ravel())
-        held = held_positions(equilibria, median) + damping * dc
-        x, f = median.x + dz[:n].reshape(-1, 3), median.forces + dz[n:].reshape(-1, 3)
+        x = turning.step(median.x, dz[:n].reshape(-1, 3))
+        f = median.forces + dz[n:].reshape(-1, 3)
+        held = equilibria.patches.mean(x) + RIG_COMPLIANCE * f
         trial = equilibria.solve_median(rho, held, x, f, SEARCH_TOLERANCE, NEWTON_STEPS)
         left = _least_moves(columns[n:], wanted - trial.forces)
         if trial.solution.converged and np.linalg.norm(left) <= (1 - damping / 4) * size:

@@ -210,7 +210,7 @@ def test_a_stage_command_runs_up_to_its_stage_and_tells_what_is_out_of_date(scen
     assert not Path("runs/two-tets/report.json").exists()
     fab4d("run", scene)
     (scene / "scene.toml").write_text(SCENE + "[goal]\ntolerance = 1\n")
-    assert "out of date, of an earlier run: report.json" in fab4d("solve", scene).stdout
+    assert "out of date, of an earlier run: print/smp.stl, report.json" in fab4d("solve", scene).stdout
     forced = fab4d("solve", scene, "--force").stderr
     assert "check      current" in forced
     assert "solve      runs: forced" in forced
