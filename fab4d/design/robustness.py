@@ -136,7 +136,8 @@ def with_moved_points(equilibria: Equilibria, design: Design, response: Response
     held, d = held_positions(equilibria, design.median) + dc, dc.ravel()
     x, f, y = design.median.x, design.median.forces, design.final.y
     dx, df, dy = (part.reshape(-1, 3) for part in (response.dx_dc @ d, response.df_dc @ d, response.dy_dc @ d))
-    for guess in ((x + dx, f + df, y + dy), (x, f, y)):
+    ahead = equilibria.held_turning.step(x, dx), f + df, equilibria.free_turning.step(y, dy)
+    for guess in (ahead, (x, f, y)):
         found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS)
         if found is not None:
             return found
