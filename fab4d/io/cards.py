@@ -49,6 +49,8 @@ class RigCard:
     patch_radius: float
     pull_only: bool
     source: str
+    max_travel: float | None = None
+    """How far it moves a point, mm; None where the card does not tell."""
 
 
 _MODULI = {"mu_MPa": Key(positive, required=True), "kappa_MPa": Key(positive, required=True)}
@@ -88,6 +90,7 @@ _RIG = {
     "max_force_N": Key(positive, required=True),
     "patch_radius_mm": Key(positive, required=True),
     "pull_only": Key(flag, required=True),
+    "max_travel_mm": Key(positive),
 }
 
 

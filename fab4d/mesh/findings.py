@@ -8,7 +8,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found: how bad (`error`, `repaired`, `warning`), in which file, how often, and up to five places.
+    """One thing found: how bad (`error`, `repaired`, `warning`; `hint`: what could be better), in which file, how often,
+    and up to five places.
 
     indices : vertex or tet numbers of the user's file, from 0
     """

@@ -32,6 +32,7 @@ from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_co
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
 from fab4d.report.verdict import DEFAULT_TOLERANCE
+from fab4d.stages._advice import clamp_findings, point_findings, suggested_clamp, travel_findings
 from fab4d.stages._target import Target, reachable_target
 from fab4d.stages.monitor import Monitor
 from fab4d.units import MM_PER_UNIT, mm_per
@@ -63,14 +64,17 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     clamp = resolve_clamp(profile["clamp"], pair, permanent)
     nothing_to_program, found = check_motion(pair, clamp)
     findings += [*_refuse(found), *_refuse(check_boundary(pair, clamp))]
-    target = Target(pair, [])
+    target, suggested, tolerance = Target(pair, []), None, _tolerance(profile["goal"], pair)
     if not nothing_to_program:
         monitor.progress("target")
-        target = reachable_target(pair, clamp, profile["materials"], _tolerance(profile["goal"], pair))
+        target = reachable_target(pair, clamp, profile["materials"], tolerance)
         findings += [*_refuse(target.findings), *_strong_deformation(target.pair, profile["materials"])]
+        monitor.progress("outlook")
+        suggested = None if clamp.any() else suggested_clamp(target.pair, tolerance, profile["units"])
+        findings += [*_outlook(target, clamp, tolerance, profile), *clamp_findings(target.pair, suggested)]
     monitor.progress("self-intersection")
     findings += _refuse(_self_intersections(target.pair, nothing_to_program))
-    report = _report(target, clamp, findings, nothing_to_program)
+    report = _report(target, clamp, findings, nothing_to_program) | {"suggested_clamp": suggested}
     return {"mesh": _arrays(target, clamp), "check_report": report}
 
 
@@ -90,6 +94,15 @@ def _self_intersections(pair: Pair, nothing_to_program: bool) -> list[Finding]:
         return printed
     advice = "the part would have to pass through itself, and nothing here keeps it from doing so; move them apart"
     return check_crossings(pair, pair.X_temp, pair.files[1], "warning", advice)
+
+
+def _outlook(target: Target, clamp: BoolArray, tolerance: float, profile: Mapping[str, Any]) -> list[Finding]:
+    pair, rig = target.pair, profile["rig"]
+    wanted = pair.X_temp if target.wanted is None else target.wanted
+    return [
+        *point_findings(pair, clamp, wanted, tolerance, profile["goal"], rig),
+        *travel_findings(pair, clamp, rig),
+    ]
 
 
 def _tolerance(goal: Goal, pair: Pair) -> float:
@@ -357,6 +370,7 @@ def _box(low: Sequence[float] | FloatArray, high: Sequence[float] | FloatArray) 
 
 def _statistics(pair: Pair, clamp: BoolArray) -> dict[str, float | int]:
     F = deformation_gradients(pair.X, pair.X_temp, pair.tets)
+    stretch = largest_stretches(F)
     residuals = rigid_residuals(pair.X, pair.X_temp)
     boundary = np.unique(face_table(pair.tets).boundary)
     return {
@@ -369,7 +383,8 @@ def _statistics(pair: Pair, clamp: BoolArray) -> dict[str, float | int]:
         "volume_mm3": float(tet_volumes(pair.X, pair.tets).sum()),
         "min_dihedral_deg": float(min_dihedral_angles(pair.X, pair.tets).min()),
         "min_det_F": float(np.linalg.det(F).min()),
-        "max_stretch": float(largest_stretches(F).max()),
+        "max_stretch": float(stretch.max()),
+        "p99_stretch": float(np.percentile(stretch, 99)),
         "target_rms_mm": float(np.sqrt(np.mean(residuals**2))),
         "target_max_mm": float(residuals.max()),
         "clamp_deformation_mm": clamp_deformation(pair, clamp),

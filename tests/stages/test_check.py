@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fab4d.elasticity.neo_hooke import energy_density
 from fab4d.errors import MeshError, SceneError
-from fab4d.io.cards import load_material, load_printer
+from fab4d.io.cards import RigCard, load_material, load_printer, load_rig
 from fab4d.io.meshes import RawMesh, read_mesh
 from fab4d.io.scene import ClampRegion, Goal, load_scene
 from fab4d.materials.cards import MaterialCard
@@ -65,13 +65,16 @@ def check(
     material: str = "paper-corrected",
     tolerance: float | None = None,
     materials: MaterialCard | None = None,
+    max_forces: int | None = None,
+    rig: RigCard | None = None,
 ) -> tuple[Arrays, dict[str, Any]]:
     profile = {
         "units": units,
         "clamp": clamp,
         "printer": load_printer("generic-dual-0.4", Path()),
         "materials": materials or load_material(material, Path()),
-        "goal": Goal(tolerance),
+        "goal": Goal(tolerance, max_forces),
+        "rig": rig or load_rig("bench", Path()),
         "gravity": None,
     }
     result = run({"permanent": permanent, "temporary": temporary}, profile, SilentMonitor())
@@ -446,7 +449,7 @@ def test_a_deformation_that_no_solid_follows_is_refused_with_what_limits_it(fact
 def test_a_stretch_that_one_material_does_not_bear_is_told() -> None:
     soft = replace(load_material("paper-corrected", Path()), tpe_max_stretch=1.2)
     _, report = check_points(X, X * [1.5, 1, 1], clamp=(), materials=soft)
-    assert {"stretch-tpe"} == codes(report).keys()
+    assert {"stretch-tpe", "suggested-clamp"} == codes(report).keys()
 
 
 def test_a_doubtful_material_is_told() -> None:
@@ -493,6 +496,79 @@ def test_without_a_clamp_a_moved_temporary_shape_stays_where_it_is() -> None:
 def test_a_clamp_that_would_have_to_deform_is_told() -> None:
     _, report = check_points(X, X * [1, 1.5, 1], tolerance=1.0)
     assert codes(report)["clamp-deforms"]["severity"] == "warning"
+
+
+# What is foreseen.
+
+
+def comb(bends: list[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A plate of 10 x 60 mm with three arms of 40 mm along x, each bent upwards by its angle (degrees) from the plate
+    on: X, X_temp, tets."""
+    x, tets = grid(10, 12, 1, size=5.0)
+    centre = x[tets].mean(axis=1)
+    kept = (centre[:, 0] < 10) | (np.mod(centre[:, 1], 25) < 10)
+    used, tets = np.unique(tets[kept], return_inverse=True)
+    x = x[used]
+    degrees = np.array(bends)[np.minimum(x[:, 1] // 25, 2).astype(int)]
+    rate, along = np.maximum(np.radians(np.abs(degrees)), 1e-9) / 40, np.maximum(x[:, 0] - 10, 0)
+    arm = 1 / rate - x[:, 2]
+    y = np.column_stack(
+        [np.minimum(x[:, 0], 10) + arm * np.sin(rate * along), x[:, 1], 1 / rate - arm * np.cos(rate * along)]
+    )
+    return x, np.where((degrees > 0)[:, None], y, x), tets.reshape(-1, 4)
+
+
+PLATE = (ClampRegion(box=((-1, -1, -1), (5, 99, 99))),)
+
+
+@pytest.mark.parametrize(("bends", "points", "enough"), [([60, 60, 60], 3, True), ([60, 60, 60], 2, False)])
+def test_each_limb_that_bends_needs_a_point(bends: list[float], points: int, enough: bool) -> None:
+    x, y, tets = comb(bends)
+    _, report = check_points(x, y, tets, clamp=PLATE, max_forces=points)
+    assert ("too-few-points" not in codes(report)) == enough
+    if not enough:
+        assert "3 limbs change their own shape" in codes(report)["too-few-points"]["message"]
+        assert codes(report)["too-few-points"]["severity"] == "warning"
+
+
+def test_limbs_that_keep_their_shape_need_no_point() -> None:
+    x, y, tets = comb([60, 0, 0])
+    _, report = check_points(x, y, tets, clamp=PLATE, max_forces=1)
+    assert "too-few-points" not in codes(report)
+
+
+def test_a_motion_beyond_the_travel_of_the_rig_is_told() -> None:
+    x, y, tets = comb([60, 0, 0])
+    short = replace(load_rig("bench", Path()), max_travel=10.0)
+    _, report = check_points(x, y, tets, clamp=PLATE, rig=short)
+    assert "farther than the 10 mm" in codes(report)["travel"]["message"]
+    assert np.linalg.norm((y - x)[codes(report)["travel"]["indices"]], axis=1).min() > 10
+    _, report = check_points(x, y, tets, clamp=PLATE, rig=replace(short, max_travel=99.0))
+    assert "travel" not in codes(report)
+
+
+@pytest.mark.parametrize(("units", "mm"), [("mm", 1.0), ("m", 1000.0)])
+def test_a_clamp_is_suggested_where_the_part_moves_as_one(units: str, mm: float) -> None:
+    x, y, tets = comb([60, 60, 60])
+    _, report = check_points(x / mm, y / mm, tets, clamp=(), units=units)
+    low, high = np.array(report["suggested_clamp"]["box"])
+    np.testing.assert_allclose([low[0], high[0]], [0, 10 / mm], atol=1e-3 / mm)
+    assert f"box = {report['suggested_clamp']['box']}" in codes(report)["suggested-clamp"]["message"]
+    # It is a clamp of a scene, and a good one.
+    box = tuple(tuple(float(v) * mm for v in corner) for corner in (low, high))
+    mesh, report = check_points(x, y, tets, clamp=(ClampRegion(box=box),))
+    assert codes(report).keys() <= {"one-tet-thick", "moved"}
+    assert mesh["clamp"].sum() == np.count_nonzero(x[:, 0] <= 10)
+    assert report["statistics"]["clamp_deformation_mm"] < 1e-3
+
+
+def test_no_clamp_is_suggested_where_there_is_one_or_nothing_moves_as_one() -> None:
+    _, report = check_points(X, Y)
+    assert report["suggested_clamp"] is None
+    wavy = Y + 0.3 * np.random.default_rng(8).normal(size=X.shape)
+    _, report = check_points(X, wavy, clamp=())
+    assert report["suggested_clamp"] is None
+    assert "suggested-clamp" not in codes(report)
 
 
 # 9. Boundary, components, clamp.
