@@ -8,10 +8,9 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found: how bad (`error`, `repaired`, `warning`; `hint`: what could be better), in which file, how often,
-    and up to five places.
+    """One thing found: how bad (`error`, `repaired`, `warning`), or a `hint`; in which file, how often, and where.
 
-    indices : vertex or tet numbers of the user's file, from 0
+    indices : up to five vertex or tet numbers of the user's file, from 0
     """
 
     code: str

@@ -39,6 +39,7 @@ def report_page(
         forces=_forces(scene["points"]),
         careful=_careful(report["sensitivity"]),
         stages=_stages(report),
+        findings=_bullets(f"{found['severity']}: {found['message']}" for found in report["findings"]),
         left_out=_bullets(f"{item['what']}: {item['why']}" for item in report["left_out"]),
         origin=_origin(report),
         # Numbers and base64 only: nothing in it can end the script element.

@@ -13,6 +13,7 @@ import numpy as np
 from fab4d.runner.display import duration
 from fab4d.runner.job import Job
 from fab4d.runner.runner import Selection, Step, plan
+from fab4d.runner.summary import finding_lines
 from fab4d.runner.table import stage_table
 from fab4d.runner.workspace import Workspace
 
@@ -43,6 +44,7 @@ def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[s
         f"{job.scene.name}: {len(mesh['X'])} vertices, {n_tets} tets, {_extent(mesh['X'])}",
         f"run folder: {job.workspace.root}",
         *(f"  {step.stage:<10} {step.state:<8} {step.reason}".rstrip() for step in steps),
+        *finding_lines(check_report.get("findings", [])),
         *_left_out_lines(check_report),
         _expectation(steps, n_tets),
     ]

@@ -1,6 +1,6 @@
 """What commands print: verdict and reasons first, then the figures, then where the files are."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,7 @@ def report_lines(report: Mapping[str, Any]) -> list[str]:
         str(report["verdict"]),
         *(f"  - {reason}" for reason in report["reasons"]),
         *(f"  {label:<8} {form(value)}" for label, form, value in figures),
+        *(f"  {line}" for line in finding_lines(report.get("findings", []))),
         *warning_lines(report.get("printing", {})),
     ]
 
@@ -105,9 +106,14 @@ def file_lines(workspace: Workspace) -> list[str]:
     return [f"files in {workspace.root}:", *(f"  {path:<20} {note}" for path, note in paths)]
 
 
+def finding_lines(findings: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The findings of the mesh doctor."""
+    return [f"{found['severity']:<8} {found['code']}: {found['message']}" for found in findings]
+
+
 def doctor_lines(check_report: Mapping[str, Any]) -> list[str]:
     """The findings of the mesh doctor, then the figures of the two shapes."""
-    findings = [f"{found['severity']:<8} {found['code']}: {found['message']}" for found in check_report["findings"]]
+    findings = finding_lines(check_report["findings"])
     if check_report["nothing_to_program"]:
         findings.append("nothing to program: the shapes are equal up to a rigid motion")
     statistics = [f"  {name:<22} {value:.6g}" for name, value in check_report["statistics"].items()]

@@ -120,6 +120,11 @@ def _printing(reports: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _findings(check_report: Mapping[str, Any]) -> list[dict[str, str]]:
+    """What the mesh doctor found, repaired or advises."""
+    return [{key: found[key] for key in ("severity", "code", "message")} for found in check_report["findings"]]
+
+
 def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, Any]:
     run, tau_s = inputs["run"], (inputs["solve_report"] or {}).get("tau_s")
     stages = [
@@ -129,6 +134,7 @@ def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, 
         "tau_s": tau_s,
         "wall_s": run["wall_s"],
         "peak_rss_mb": run["peak_rss_mb"],
+        "findings": _findings(inputs["check_report"]),
         "left_out": left_out_of(reports),
         "stages": stages,
         "versions": run["versions"],

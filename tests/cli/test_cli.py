@@ -237,6 +237,7 @@ def test_plan_tells_size_stages_what_is_left_out_and_what_to_expect(scene: Path,
     assert before.startswith("two tets: 4 vertices, 1 tets, 50 x 50 x 50 mm\n")
     assert "  solve      runs     not run yet" in before
     assert "  gravity: the scene has none" in before
+    assert "warning  thin: one tet thick" in before
     assert "expected, roughly" in before
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
     fab4d("run", scene)

@@ -149,6 +149,13 @@ def test_every_card_that_comes_along_loads_under_its_name(kind: str) -> None:
         assert len(card.source) > 20
 
 
+def test_a_rig_card_may_state_its_travel(tmp_path: Path) -> None:
+    own = (CARDS / "rigs" / "bench.toml").read_text(encoding="utf-8")
+    (tmp_path / "own.toml").write_text(own + "\nmax_travel_mm = 80\n")
+    assert load_rig("own.toml", tmp_path).max_travel == 80.0
+    assert load_rig("bench", tmp_path).max_travel is None
+
+
 def test_the_three_presets_differ_where_the_paper_is_misprinted() -> None:
     corrected, printed, fig7 = (load_material(name, Path()) for name in ("paper-corrected", "paper-printed", "fig7"))
     assert corrected.warnings() == []

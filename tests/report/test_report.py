@@ -13,6 +13,7 @@ from PIL import Image
 from fab4d.errors import ArtifactError
 from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal
+from fab4d.runner.summary import report_lines
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.report import run
 
@@ -20,7 +21,7 @@ FIELDS = [
     *("verdict", "reasons", "error", "target_displacement_mm", "target_projection", "smp_fraction", "forces"),
     *("ambiguous_fraction", "isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual"),
     *("min_det_F", "element_order", "mass_g", "cost_usd", "sensitivity", "printing", "tau_s", "wall_s"),
-    *("peak_rss_mb", "left_out", "stages", "versions", "inputs"),
+    *("peak_rss_mb", "findings", "left_out", "stages", "versions", "inputs"),
 ]
 
 
@@ -41,6 +42,22 @@ def test_the_cost_of_a_projected_target_is_told_and_part_of_the_error(inputs, pr
     assert result["report_json"]["target_projection"] == {"rms_mm": 0.123, "max_mm": 0.5}
     assert result["report_json"]["error"]["rms_mm"] > before["error"]["rms_mm"]
     assert b"0.123 mm" in result["report_html"]
+
+
+def test_what_the_doctor_found_is_told(inputs, profile):
+    found = {
+        "code": "travel",
+        "severity": "warning",
+        "file": "temp.vtu",
+        "message": "too far <for> the rig",
+        "count": 2,
+    }
+    inputs["check_report"]["findings"] = [found]
+    result = run(inputs, profile, SilentMonitor())
+    expected = {"severity": "warning", "code": "travel", "message": "too far <for> the rig"}
+    assert result["report_json"]["findings"] == [expected]
+    assert b"warning: too far &lt;for&gt; the rig" in result["report_html"]
+    assert "  warning  travel: too far <for> the rig" in report_lines(result["report_json"])
 
 
 def test_report_has_the_fields_of_the_contract_verdict_first(result):
