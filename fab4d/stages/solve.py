@@ -5,17 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
-from fab4d.design.gauss_newton import equilibrate
-from fab4d.design.objective import shape_error
-from fab4d.design.patches import build_patches
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, change_density, refit, solve_reduced
-from fab4d.errors import ArtifactError, EquilibriumError, SceneError
+from fab4d.design.reduced import ReducedSettings, Search, Watch, at_rest, solve_reduced
+from fab4d.errors import SceneError
 from fab4d.io.scene import Goal, RigCard
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
+from fab4d.stages._printed import as_printed
+from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
-from fab4d.stages.threshold import labels_for
 
 CHECKPOINT, BEST = "iterate", "best"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
@@ -66,7 +63,7 @@ def _search(
         settings = _settings(problem, profile, attempt)
         watch = _watch(attempt, start, trace, monitor)
         found = solve_reduced(problem, settings, watch, start)
-        rms, start = _printed_rms(problem, mesh, profile, settings, found), None
+        rms, start = as_printed(problem, mesh, profile["printer"], settings.weights, found).rms, None
         if best is None or rms < least:
             best, least = found, rms
             monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
@@ -86,23 +83,6 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor) -
         monitor.save(CHECKPOINT, _checkpoint(attempt, at, trace))
 
     return watch
-
-
-def _printed_rms(
-    problem: Problem,
-    mesh: Mapping[str, np.ndarray],
-    profile: Mapping[str, Any],
-    settings: ReducedSettings,
-    found: Search,
-) -> float:
-    """RMS error in L0 of the design with printable labels and refitted held positions; inf where there is none."""
-    labels = labels_for(mesh["X"], mesh["tets"], found.design.rho, profile["printer"])
-    try:
-        design = change_density(found.equilibria, found.design, labels.smp.astype(np.float64))
-    except EquilibriumError:
-        return np.inf
-    design = refit(found.equilibria, design, settings.weights, lambda at: None)  # noqa: ARG005
-    return shape_error(problem, design.final.y).rms
 
 
 def _settings(problem: Problem, profile: Mapping[str, Any], attempt: int) -> ReducedSettings:
@@ -128,22 +108,9 @@ def _artifacts(problem: Problem, found: Search, trace: Trace, report: dict[str, 
     }
 
 
-_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow")
-
-
 def _checkpoint(attempt: int, at: Search, trace: Trace) -> dict[str, np.ndarray]:
-    design = at.design
-    return {
-        "attempt": np.array(attempt),
-        "phase": np.array(at.phase.value),
-        "numbers": np.array([getattr(at, name) for name in _NUMBERS], dtype=np.float64),
-        "centers": at.equilibria.patches.centers,
-        "rho": design.rho,
-        "x": design.median.x,
-        "forces": design.median.forces,
-        "y": design.final.y,
-        "trace": np.frombuffer(trace.csv(), np.uint8),
-    }
+    numbers = {"attempt": np.array(attempt), "trace": np.frombuffer(trace.csv(), np.uint8)}
+    return search_arrays(at) | numbers
 
 
 def _resumed(problem: Problem, profile: Mapping[str, Any], trace: Trace, monitor: Monitor) -> tuple[int, Search | None]:
@@ -152,24 +119,9 @@ def _resumed(problem: Problem, profile: Mapping[str, Any], trace: Trace, monitor
     if saved is None:
         return 0, None
     trace.go_on(saved["trace"].tobytes())
-    return int(saved["attempt"]), _search_state(problem, profile, saved)
+    return int(saved["attempt"]), search_from(problem, profile["rig"], saved)
 
 
 def _restored_best(problem: Problem, profile: Mapping[str, Any], monitor: Monitor) -> tuple[Search | None, float]:
     saved = monitor.restore(BEST)
-    return (None, np.inf) if saved is None else (_search_state(problem, profile, saved), float(saved["rms"]))
-
-
-def _search_state(problem: Problem, profile: Mapping[str, Any], saved: Mapping[str, np.ndarray]) -> Search:
-    """The state that `_checkpoint` saved; its shapes are in equilibrium as they are."""
-    radius = profile["rig"].patch_radius / problem.length
-    equilibria = Equilibria(problem, build_patches(problem, saved["centers"], radius))
-    held = equilibria.patches.mean(saved["x"]) + RIG_COMPLIANCE * saved["forces"]
-    design = equilibrate(equilibria, saved["rho"], held, saved["x"], saved["forces"], saved["y"])
-    if design is None:
-        msg = "a checkpoint of the solver is not in equilibrium: run again with --force"
-        raise ArtifactError(msg)
-    lam_SMP, lam_round, damping, iteration, slow = saved["numbers"].tolist()
-    return Search(
-        equilibria, design, Phase(str(saved["phase"])), lam_SMP, lam_round, damping, int(iteration), int(slow)
-    )
+    return (None, np.inf) if saved is None else (search_from(problem, profile["rig"], saved), float(saved["rms"]))

@@ -1,0 +1,46 @@
+"""The state of a search as arrays and back."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
+from fab4d.design.gauss_newton import equilibrate
+from fab4d.design.patches import build_patches
+from fab4d.design.problem import Problem
+from fab4d.design.reduced import Phase, Search
+from fab4d.errors import ArtifactError
+from fab4d.io.scene import RigCard
+
+_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow")
+
+
+def search_arrays(at: Search) -> dict[str, np.ndarray]:
+    """All that `search_from` needs to go on as if nothing had happened."""
+    design = at.design
+    return {
+        "phase": np.array(at.phase.value),
+        "numbers": np.array([getattr(at, name) for name in _NUMBERS], dtype=np.float64),
+        "centers": at.equilibria.patches.centers,
+        "rho": design.rho,
+        "x": design.median.x,
+        "forces": design.median.forces,
+        "y": design.final.y,
+    }
+
+
+def search_from(problem: Problem, rig: RigCard, saved: Mapping[str, np.ndarray]) -> Search:
+    """The state that `search_arrays` saved; its shapes are in equilibrium as they are.
+
+    Raises ArtifactError when they are not.
+    """
+    equilibria = Equilibria(problem, build_patches(problem, saved["centers"], rig.patch_radius / problem.length))
+    held = equilibria.patches.mean(saved["x"]) + RIG_COMPLIANCE * saved["forces"]
+    design = equilibrate(equilibria, saved["rho"], held, saved["x"], saved["forces"], saved["y"])
+    if design is None:
+        msg = "a saved state of the solver is not in equilibrium: run again with --force"
+        raise ArtifactError(msg)
+    lam_SMP, lam_round, damping, iteration, slow = saved["numbers"].tolist()
+    return Search(
+        equilibria, design, Phase(str(saved["phase"])), lam_SMP, lam_round, damping, int(iteration), int(slow)
+    )
