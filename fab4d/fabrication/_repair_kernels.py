@@ -12,7 +12,7 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 # Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile.
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _inner = njit(cache=True, **_NO_ENTRY)
-FREE, LOCK_STEPS, MOST_FLIPS, MOST_SKIPS = -1, 12, 6, 40
+FREE, LOCK_STEPS, LIMITLESS = -1, 12, 1 << 40
 EACH_TET, WHOLE_STAR = -2, -1
 
 
@@ -24,7 +24,6 @@ class State(NamedTuple):
     cost: FloatArray
     pinched: BoolArray
     defects: IntArray
-    flips: IntArray
     locked_until: IntArray
     only: IntArray
 
@@ -164,15 +163,23 @@ def _fresh_stamp(scratch: Scratch) -> int:
 
 
 @_inner
-def _change(tets: IntArray, state: State, links: Links, scratch: Scratch) -> int:
-    """Change of the number of defects when `tets` flip."""
-    _flip(tets, state)
+def _change(v: int, tets: IntArray, limit: int, state: State, links: Links, scratch: Scratch) -> int:
+    """Change of the number of defects when `tets`, all at v, flip; any number above `limit` if it exceeds that."""
     stamp, change = _fresh_stamp(scratch), 0
     for t in tets:
         for u in links.vertices[t]:
             if scratch.stamp[u] != stamp:
                 scratch.stamp[u] = stamp
-                change += vertex_defects(u, state.pinched, state.smp, links, scratch) - state.defects[u]
+                change -= state.defects[u]
+    # So far it stands for no defect left, and only grows from here.
+    _flip(tets, state)
+    change += vertex_defects(v, state.pinched, state.smp, links, scratch)
+    scratch.stamp[v] = 0
+    for t in tets:
+        for u in links.vertices[t]:
+            if scratch.stamp[u] == stamp and change <= limit:
+                scratch.stamp[u] = 0
+                change += vertex_defects(u, state.pinched, state.smp, links, scratch)
     _flip(tets, state)
     return change
 
@@ -182,7 +189,7 @@ def _allowed(tets: IntArray, step: int, state: State) -> bool:
     only = state.only[0]
     for t in tets:
         if only == FREE:
-            if state.flips[t] >= MOST_FLIPS or state.locked_until[t] > step:
+            if state.locked_until[t] > step:
                 return False
         elif state.smp[t] != (only == 1):
             return False
@@ -199,16 +206,25 @@ def _price(tets: IntArray, state: State) -> float:
 
 
 @_inner
-def _try(count: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
+def _limit(price: float, best: tuple) -> int:
+    """The largest change of defects with which a move of that price is better than `best`."""
+    if best[0] > 0:
+        return best[0] - (1 if price < best[1] else 2)
+    return -1 - int(min(price / best[1], 1e6)) if best[1] > 0 else -LIMITLESS
+
+
+@_inner
+def _try(v: int, count: int, step: int, best: tuple, state: State, links: Links, scratch: Scratch) -> tuple:
     """`best` (rank, price, count), or the move scratch.members[:count] if it is better (kept in scratch.best)."""
     tets = scratch.members[:count]
     if not _allowed(tets, step, state):
         return best
-    change = _change(tets, state, links, scratch)
     price = _price(tets, state)
-    rank, price = (0, price / -change) if change < 0 else (1 + change, price)
-    if rank > best[0] or (rank == best[0] and price >= best[1]):
+    limit = _limit(price, best)
+    change = _change(v, tets, limit, state, links, scratch)
+    if change > limit:
         return best
+    rank, price = (0, price / -change) if change < 0 else (1 + change, price)
     for k in range(count):
         scratch.best[k] = tets[k]
     return rank, price, count
@@ -219,13 +235,24 @@ def _kinds_of_moves(v: int, state: State, links: Links, scratch: Scratch) -> int
     """EACH_TET, WHOLE_STAR and the four-face edges at v into scratch.nodes; returns how many."""
     scratch.nodes[0], scratch.nodes[1], count = EACH_TET, WHOLE_STAR, 2
     _load_bits(v, state.smp, links, scratch)
+    # Inside the part both materials have the same boundary.
     for value in (True, False):
+        if not value and not links.on_surface[v]:
+            break
         _boundary_excess(v, value, links, scratch)
         for node in range(links.n_nodes[v]):
-            if scratch.degree[node] > 2:
+            if scratch.degree[node] > 2 and not _holds(scratch.nodes, count, node):
                 scratch.nodes[count] = node
                 count += 1
     return count
+
+
+@_inner
+def _holds(values: IntArray, count: int, value: int) -> bool:
+    found = False
+    for k in range(count):
+        found = found or values[k] == value
+    return found
 
 
 @_inner
@@ -241,7 +268,7 @@ def _best_move(v: int, step: int, worst: int, state: State, links: Links, scratc
         _group_tets(v, scratch.nodes[i], links, scratch)
         for k in range(size):
             if scratch.group[k] == k:
-                best = _try(_gather(v, k, links, scratch), step, best, state, links, scratch)
+                best = _try(v, _gather(v, k, links, scratch), step, best, state, links, scratch)
     return best[2]
 
 
@@ -266,40 +293,81 @@ def _pop(queue: Queue) -> int:
 
 
 @_inner
-def _apply(count: int, step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> None:
-    tets = scratch.best[:count]
+def _apply(tets: IntArray, step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> int:
+    """Flip `tets`, lock them, and let the defective vertices around wait; returns the change of defects."""
     _flip(tets, state)
-    stamp = _fresh_stamp(scratch)
+    stamp, change = _fresh_stamp(scratch), 0
     for t in tets:
-        state.flips[t] += 1
         state.locked_until[t] = step + LOCK_STEPS
         for u in links.vertices[t]:
             if scratch.stamp[u] != stamp:
                 scratch.stamp[u] = stamp
+                change -= state.defects[u]
                 state.defects[u] = vertex_defects(u, state.pinched, state.smp, links, scratch)
+                change += state.defects[u]
                 if state.defects[u] > 0:
                     _push(u, True, queue)
+    return change
 
 
-@njit(cache=True)
-def search(state: State, links: Links, scratch: Scratch, queue: Queue) -> int:
-    """Flip tets until no vertex is defective or none can be helped; returns the defects left."""
-    skips = np.zeros(len(state.defects), np.int64)
-    for v in range(len(state.defects)):
-        if state.defects[v] > 0:
-            _push(v, True, queue)
-    step = 0
+@_inner
+def _descend(step: int, state: State, links: Links, scratch: Scratch, queue: Queue) -> int:
+    """Take improving moves (one-way: any move) at the waiting vertices and at what these touch; returns the step."""
+    worst = 1 if state.only[0] == FREE else LIMITLESS
     while queue.ends[1] > 0:
         step += 1
         v = _pop(queue)
-        if state.defects[v] == 0:
+        if state.defects[v] > 0:
+            count = _best_move(v, step, worst, state, links, scratch)
+            if count > 0:
+                _apply(scratch.best[:count], step, state, links, scratch, queue)
+    return step
+
+
+@_inner
+def _excursion(v: int, step: int, state: State, links: Links, scratch: Scratch, queue: Queue, trail: IntArray) -> bool:
+    """Moves that also add defects, at v and at what they spoil: kept once fewer are left, taken back after a while."""
+    balance, flipped = 0, 0
+    _push(v, True, queue)
+    while queue.ends[1] > 0 and flipped + len(scratch.best) <= len(trail):
+        step += 1
+        u = _pop(queue)
+        if state.defects[u] == 0:
             continue
-        count = _best_move(v, step, 1 + skips[v] if state.only[0] == FREE else 1 << 40, state, links, scratch)
-        if count > 0:
-            _apply(count, step, state, links, scratch, queue)
-        skips[v] += count == 0
-        if state.defects[v] > 0 and skips[v] < MOST_SKIPS:
-            _push(v, count > 0, queue)
+        count = _best_move(u, step, LIMITLESS, state, links, scratch)
+        for k in range(count):
+            trail[flipped + k] = scratch.best[k]
+        flipped += count
+        balance += _apply(scratch.best[:count], step, state, links, scratch, queue)
+        if balance < 0:
+            return True
+    for k in range(flipped):
+        _apply(trail[k : k + 1], 0, state, links, scratch, queue)
+    while queue.ends[1] > 0:
+        _pop(queue)
+    return False
+
+
+@njit(cache=True)
+def search(state: State, links: Links, scratch: Scratch, queue: Queue, trail: IntArray) -> int:
+    """Flip tets until no vertex is defective or none can be helped; returns the defects left.
+
+    trail : work space, as long as the longest excursion
+    """
+    for v in range(len(state.defects)):
+        if state.defects[v] > 0:
+            _push(v, True, queue)
+    step = _descend(0, state, links, scratch, queue)
+    helped = state.only[0] == FREE
+    while helped:
+        helped = False
+        for v in range(len(state.defects)):
+            while state.defects[v] > 0:
+                step += LOCK_STEPS + len(trail)
+                if not _excursion(v, step, state, links, scratch, queue, trail):
+                    break
+                helped = True
+                step = _descend(step + len(trail), state, links, scratch, queue)
     left = 0
     for defects in state.defects:
         left += defects

@@ -11,7 +11,7 @@ from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import TET_FACES, face_table
 
-MAX_ROUNDS = 4
+MAX_ROUNDS = 3
 
 
 def without_thin_places(

@@ -3,9 +3,10 @@
 A labelled tet mesh nearly always has edges with four boundary faces and vertices where two cones of one material touch.
 Slicers drop or merge such places differently, so the labels are changed there: a local search at each defective vertex
 flips the tet, the component of the star, or the sector around an edge that costs least per defect removed. Where
-nothing removes a defect, a flip that keeps or adds some is taken after other places have had their turn. A flipped
-tet is locked for some steps and flips a limited number of times, so the search ends. What it leaves, if anything, is
-removed by flips of one label only, which cannot go on for ever either: at the worst one material is left.
+nothing removes a defect, an excursion starts: flips that keep or add some, each locked for some steps, until fewer
+defects are left than before or, after a limited number, all of it is taken back. So the defects only fall and the
+search ends. What it leaves, if anything, is removed by flips of one label only, which cannot go on for ever either:
+at the worst one material is left.
 """
 
 import numpy as np
@@ -13,6 +14,9 @@ import numpy as np
 from fab4d.fabrication._links import Links, links_of, split_fans
 from fab4d.fabrication._repair_kernels import FREE, Queue, Scratch, State, all_defects, search
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+LONGEST_EXCURSION = 50
+"""Flips after which moves that added defects are taken back."""
 
 
 def pinched_vertices(tets: IntArray, smp: BoolArray | None = None) -> IntArray:
@@ -39,7 +43,7 @@ def well_composed(tets: IntArray, smp: BoolArray, flip_cost: FloatArray) -> Bool
     pinched = all_defects(nowhere, np.ones(len(tets), bool), links, scratch) > 0
     state = _state(smp, smp, flip_cost, pinched, FREE, links, scratch)
     # Where nothing is to be done the search need not even be compiled.
-    if not state.defects.any() or search(state, links, scratch, _queue(links)) == 0:
+    if not state.defects.any() or search(state, links, scratch, _queue(links), _trail(scratch)) == 0:
         return state.smp
     return _one_way(state, links, scratch)
 
@@ -49,7 +53,7 @@ def _one_way(state: State, links: Links, scratch: Scratch) -> BoolArray:
     results = []
     for only in (1, 0):
         trial = _state(state.smp, state.original, state.cost, state.pinched, only, links, scratch)
-        search(trial, links, scratch, _queue(links))
+        search(trial, links, scratch, _queue(links), _trail(scratch))
         results.append(trial.smp)
     return min(results, key=lambda smp: float(state.cost[smp != state.original].sum()))
 
@@ -65,9 +69,9 @@ def _state(
 ) -> State:
     labels = np.array(smp, dtype=bool)
     defects = all_defects(pinched, labels, links, scratch)
-    zeros = np.zeros(len(labels), np.int64)
+    unlocked = np.zeros(len(labels), np.int64)
     original, cost = np.array(original, dtype=bool), np.array(cost, dtype=np.float64)
-    return State(labels, original, cost, pinched, defects, zeros, zeros.copy(), np.array([only]))
+    return State(labels, original, cost, pinched, defects, unlocked, np.array([only]))
 
 
 def _scratch(links: Links) -> Scratch:
@@ -79,3 +83,7 @@ def _scratch(links: Links) -> Scratch:
 def _queue(links: Links) -> Queue:
     n = len(links.n_nodes)
     return Queue(np.zeros(n, np.int64), np.zeros(n, bool), np.zeros(2, np.int64))
+
+
+def _trail(scratch: Scratch) -> IntArray:
+    return np.zeros(LONGEST_EXCURSION + len(scratch.best), np.int64)

@@ -171,6 +171,8 @@ def prusa_profile(printer: PrinterCard, flows: Iterable[float]) -> dict[str, str
         "interface_shells": "1",
         "fill_density": "100%",
         "fill_pattern": "rectilinear",
+        # At which infill and perimeters lay down the volume of a block: the default, 25 %, gives up to 3 % more.
+        "infill_overlap": "15%",
         "support_material": "0",
         "wipe_tower": "0",
         "skirts": "0",
@@ -188,7 +190,8 @@ def cura_settings(printer: PrinterCard) -> dict[str, str]:
         "infill_sparse_thickness": layer,
         "infill_line_distance": line,
         "infill_pattern": "lines",
-        "infill_overlap_mm": f"{0.1 * printer.line_width:g}",
+        # With it a block gets up to 3 % more than its volume.
+        "infill_overlap_mm": "0",
         "top_layers": "0",
         "bottom_layers": "0",
         "initial_bottom_layers": "0",

@@ -14,7 +14,7 @@ from fab4d.mesh.doctor import Pair, check_tets, clean, orient
 from fab4d.mesh.findings import Finding
 from fab4d.mesh.tetmesh import BoolArray
 from fab4d.stages.bodies import print_files
-from fab4d.stages.threshold import feature_size
+from fab4d.stages.threshold import lines_of
 
 
 def labelled_bodies(
@@ -28,7 +28,7 @@ def labelled_bodies(
     Raises MeshError for an unusable mesh, BodyError for bodies that are no solids.
     """
     pair, findings = _cleaned(raw, mm)
-    result = printable_labels(pair.X, pair.tets, smp[pair.tet_map], *feature_size(printer))
+    result = printable_labels(pair.X, pair.tets, smp[pair.tet_map], lines_of(printer))
     files = print_files(pair.X, pair.tets, result.smp, name, printer, materials)
     files["bodies_report"] |= {
         "labels": _label_figures(result),
@@ -54,6 +54,7 @@ def _cleaned(raw: RawMesh, mm: float) -> tuple[Pair, list[Finding]]:
 def _label_figures(result: LabelResult) -> dict[str, Any]:
     return {
         "changed_fraction": result.changed_fraction,
+        "feature_mm": list(result.feature),
         "defects_left": result.defects_left.tolist(),
         "part_defects": result.part_defects.tolist(),
     }

@@ -7,6 +7,7 @@ import numpy as np
 
 from fab4d.fabrication.labels import (
     LabelResult,
+    Lines,
     ambiguous_fraction,
     isolated_fraction,
     printable_labels,
@@ -37,12 +38,13 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
 def labels_for(X: FloatArray, tets: IntArray, rho: FloatArray, printer: PrinterCard) -> LabelResult:
     """`printable_labels` of the density rho (m,) for a printer; tets that the design is sure about change last."""
     sure = np.abs(rho - 0.5) + _LEAST_COST
-    return printable_labels(X, tets, rho, *feature_size(printer), flip_cost=sure * np.abs(tet_volumes(X, tets)))
+    return printable_labels(X, tets, rho, lines_of(printer), flip_cost=sure * np.abs(tet_volumes(X, tets)))
 
 
-def feature_size(printer: PrinterCard) -> tuple[float, float]:
-    """Smallest feature across and along the build direction, mm."""
-    return LINES_PER_FEATURE * printer.line_width, LAYERS_PER_FEATURE * printer.layer_height
+def lines_of(printer: PrinterCard) -> Lines:
+    """The lines of a printer and the smallest feature that they make."""
+    width, height = printer.line_width, printer.layer_height
+    return Lines(width, height, LINES_PER_FEATURE * width, LAYERS_PER_FEATURE * height)
 
 
 def _report(
@@ -59,6 +61,7 @@ def _report(
         "smp_fraction": float(volumes[labels.smp].sum() / volumes.sum()),
         "clusters": int(labels.cluster.max()),
         "changed_fraction": labels.changed_fraction,
+        "feature_mm": list(labels.feature),
         "defects_left": labels.defects_left.tolist(),
         "part_defects": labels.part_defects.tolist(),
         "acceptable": not reasons,

@@ -17,14 +17,14 @@ from fab4d.fabrication.bodies import (
     shells,
     snapped,
 )
-from fab4d.fabrication.labels import printable_labels
+from fab4d.fabrication.labels import Lines, printable_labels
 from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.topology import face_table
 
 
 def printable_bodies(X, tets, smp):
-    return bodies_from_labels(X, tets, printable_labels(X, tets, smp, 0.1, 0.1).smp)
+    return bodies_from_labels(X, tets, printable_labels(X, tets, smp, Lines(0.05, 0.05, 0.1, 0.1)).smp)
 
 
 def sorted_triangles(body):
@@ -177,7 +177,7 @@ def test_touching_bodies_are_not_taken_for_overlapping_ones(meshes, seed):
     rng = np.random.default_rng(seed)
     X, tets = meshes["irregular"](int(rng.integers(0, 150)), seed)
     smp = rng.random(len(tets)) < rng.random()
-    require_bodies(bodies_from_labels(X, tets, printable_labels(X, tets, smp, 0.84, 0.4).smp))
+    require_bodies(bodies_from_labels(X, tets, printable_labels(X, tets, smp, Lines(0.42, 0.2, 0.84, 0.4)).smp))
 
 
 def test_every_face_of_the_mesh_is_used_once(meshes):

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fab4d.fabrication.labels import (
+    Lines,
     ambiguous_fraction,
     isolated_fraction,
     printable_labels,
@@ -68,7 +69,7 @@ def test_nothing_is_absorbed_by_nothing(meshes):
 def test_any_density_becomes_printable(meshes, seed, share, feature):
     X, tets = meshes["irregular"](40, seed)
     rho = np.clip(np.random.default_rng(seed).normal(share, 0.3, len(tets)), 0, 1)
-    result = printable_labels(X, tets, rho, feature, feature / 2)
+    result = printable_labels(X, tets, rho, Lines(feature / 2, feature / 4, feature, feature / 2))
     volumes = tet_volumes(X, tets)
     assert result.defects_left.size == result.part_defects.size == 0
     assert np.array_equal(result.cluster > 0, result.smp)
@@ -78,14 +79,14 @@ def test_any_density_becomes_printable(meshes, seed, share, feature):
         assert np.all(sizes >= feature * feature * feature / 2)
     changed = volumes[(rho > 0.5) != result.smp].sum() / volumes.sum()
     assert result.changed_fraction["total"] == pytest.approx(changed)
-    again = printable_labels(X, tets, rho, feature, feature / 2)
+    again = printable_labels(X, tets, rho, Lines(feature / 2, feature / 4, feature, feature / 2))
     assert np.array_equal(again.smp, result.smp)
 
 
 def test_good_labels_stay(meshes):
     X, tets = meshes["box"]((8, 6, 6), size=2.0)
     smp = X[tets].mean(axis=1)[:, 0] < 8
-    result = printable_labels(X, tets, smp, 0.84, 0.4)
+    result = printable_labels(X, tets, smp, Lines(0.42, 0.2, 0.84, 0.4))
     assert np.array_equal(result.smp, smp)
     assert set(result.changed_fraction.values()) == {0.0}
 
@@ -94,6 +95,6 @@ def test_noise_of_single_tets_is_removed_from_a_fine_body(meshes):
     X, tets = meshes["box"]((14, 14, 10), size=0.2)
     half = X[tets].mean(axis=1)[:, 0] < 1.4
     noisy = half ^ (np.random.default_rng(0).random(len(tets)) < 0.03)
-    result = printable_labels(X, tets, noisy, 0.8, 0.4)
+    result = printable_labels(X, tets, noisy, Lines(0.4, 0.2, 0.8, 0.4))
     volumes = tet_volumes(X, tets)
     assert volumes[result.smp != half].sum() < 0.02 * volumes.sum()

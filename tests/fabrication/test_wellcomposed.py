@@ -165,3 +165,14 @@ class TestPartThatTouchesItself:
         assert len(part) >= 2
         result = repaired(X, tets, np.random.default_rng(9).random(len(tets)) < 0.5)
         assert np.setdiff1d(pinched_vertices(tets, result), part).size == 0
+
+
+def test_noise_on_an_irregular_mesh_is_repaired_and_both_materials_are_left(meshes):
+    """Once the search flipped every tet of such a mesh up and down without an end."""
+    X, tets = meshes["irregular"](1500, 8)
+    smp = np.random.default_rng(0).random(len(tets)) < 0.5
+    result = repaired(X, tets, smp)
+    assert len(pinched_vertices(tets, result)) == 0
+    assert changed_fraction(X, tets, smp, result) < 0.36
+    volumes = tet_volumes(X, tets)
+    assert 0.4 < volumes[result].sum() / volumes.sum() < 0.6

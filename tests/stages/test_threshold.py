@@ -32,7 +32,7 @@ def test_a_clear_design_is_taken_as_it_is(mesh):
     assert report["reasons"] == []
     assert report["smp_fraction"] == pytest.approx(0.5)
     assert (report["clusters"], report["ambiguous_fraction"], report["isolated_fraction"]) == (1, 0.0, 0.0)
-    assert set(report["changed_fraction"]) == {"clusters", "features", "well_composed", "total"}
+    assert set(report["changed_fraction"]) == {"clusters", "features", "well_composed", "larger_features", "total"}
 
 
 def test_an_undecided_design_is_rejected(mesh):
