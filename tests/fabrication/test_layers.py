@@ -25,7 +25,7 @@ def test_a_wall_thinner_than_a_line_stays_empty_and_the_interface_is_to_blame(me
     found = unfilled(bodies_from_labels(X, tets, wall), 0.4, 0.2)
     assert found["smp"].share == pytest.approx(1)
     assert 0.95 < found["smp"].share_inside < 1  # but for the part's own corners
-    assert found["smp"].where == pytest.approx((0.15, 1.5, found["smp"].where[2]))
+    assert found["smp"].where[:2] == pytest.approx((0.15, 1.5), abs=1e-3)
     assert found["tpe"].share_inside < 0.01
 
 
