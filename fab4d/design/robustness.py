@@ -11,6 +11,7 @@ from fab4d.design.sensitivity import linearise
 from fab4d.design.turning import Turning
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
+from fab4d.solvers.linear import SingularMatrixError
 
 PHASES = ("tpe", "rubbery", "glassy")
 NEWTON_STEPS = 25
@@ -18,7 +19,10 @@ NEWTON_STEPS = 25
 NO_STIFFNESS = 1e-9
 # Forces that differ by this part of their size count as equal.
 FORCE_TOLERANCE = 1e-4
-MOST_FORCE_STEPS, SMALLEST_DAMPING = 10, 0.05
+MOST_FORCE_STEPS, SMALLEST_DAMPING = 8, 0.05
+# A step to changed forces moves the points no farther than this, in L0, and is given up where the shape does not follow
+# in a few steps: then it has none to follow to.
+LONGEST_MOVE, FEW_NEWTON_STEPS = 0.1, 6
 # In how many parts a change of the forces is made, the second time because the first one failed.
 FORCE_PARTS = 1, 4
 
@@ -192,28 +196,41 @@ def _step_to_forces(
     """The median shape after a damped Newton step to the wanted forces (K, 3), and the damping of the next step."""
     n = median.x.size
     columns = _held_columns(equilibria, rho, median)
+    if columns is None:
+        return None
     dc = _least_moves(columns[n:], wanted - median.forces)
     size = float(np.linalg.norm(dc))
+    damping = min(damping, LONGEST_MOVE / size)
     while damping >= SMALLEST_DAMPING:
         dz = columns @ (damping * dc.ravel())
         x = turning.step(median.x, dz[:n].reshape(-1, 3))
         f = median.forces + dz[n:].reshape(-1, 3)
         held = equilibria.patches.mean(x) + RIG_COMPLIANCE * f
-        trial = equilibria.solve_median(rho, held, x, f, SEARCH_TOLERANCE, NEWTON_STEPS)
+        trial = equilibria.solve_median(rho, held, x, f, SEARCH_TOLERANCE, FEW_NEWTON_STEPS)
+        if not trial.solution.converged:
+            damping /= 4
+            continue
         left = _least_moves(columns[n:], wanted - trial.forces)
-        if trial.solution.converged and np.linalg.norm(left) <= (1 - damping / 4) * size:
+        if np.linalg.norm(left) <= (1 - damping / 4) * size:
             return trial, min(1.0, 2 * damping)
-        bend = float(np.linalg.norm(left - (1 - damping) * dc)) if trial.solution.converged else 0.0
-        damping = min(0.5 * damping, 0.5 * damping**2 * size / bend if bend else 1.0)
+        bend = float(np.linalg.norm(left - (1 - damping) * dc))
+        damping = min(damping / 2, damping**2 * size / (2 * bend))
     return None
 
 
-def _held_columns(equilibria: Equilibria, rho: FloatArray, median: Median) -> FloatArray:
-    """(3N + 3K, 3K) derivatives of the median shape and of its forces with respect to the held positions."""
+def _held_columns(equilibria: Equilibria, rho: FloatArray, median: Median) -> FloatArray | None:
+    """(3N + 3K, 3K) derivatives of the median shape and of its forces with respect to the held positions.
+
+    None where the shape is not stable even with its points locked: the part would have snapped over on the way.
+    """
     n, k = median.x.size, median.forces.size
     rhs = np.zeros((n + k, k))
     rhs[n + np.arange(k), np.arange(k)] = -1.0
-    return equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x)).solve_many(rhs)
+    try:
+        tangent = equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x))
+    except SingularMatrixError:
+        return None
+    return tangent.solve_many(rhs) if tangent.n_negative == k else None
 
 
 def _least_moves(df_dc: FloatArray, change: FloatArray) -> FloatArray:

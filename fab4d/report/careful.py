@@ -6,6 +6,10 @@ from typing import Any, TypeGuard
 
 from fab4d.report.wording import number, significant
 
+JUMPS = "jumps away"
+HARDLY_STABLE = (
+    "HARDLY STABLE: pads a little off make the part jump to another shape. Best redesign it, with more points, say."
+)
 DO_NOT_HANG_WEIGHTS = (
     "HOLD POSITIONS, DO NOT HANG WEIGHTS: under forces that do not change as the part moves, this shape is unstable."
 )
@@ -16,7 +20,7 @@ PHASES = {"tpe": "TPE", "rubbery": "hot SMP", "glassy": "cold SMP"}
 class Deviation:
     """Something that is not as designed, and the RMS error, mm, that the finished shape then has.
 
-    rms : None where no such shape was found
+    rms : None where the part has no such shape near the designed one, and jumps to another
     model : by the model of second order about the designed positions, None where it has nothing to say
     """
 
@@ -32,7 +36,7 @@ class Deviation:
     @property
     def words(self) -> str:
         """The error as printed."""
-        return "no such shape" if self.rms is None else significant(self.rms)
+        return JUMPS if self.rms is None else significant(self.rms)
 
 
 def is_measured(sensitivity: Mapping[str, Any] | None) -> TypeGuard[Mapping[str, Any]]:
@@ -50,7 +54,9 @@ def deviations(sensitivity: Mapping[str, Any]) -> list[list[Deviation]]:
     """All deviations by kind: all pads together, each pad alone, all forces, and the moduli of each phase."""
     hold = sensitivity["hold"]
     size = f"{hold['change_mm']:g} mm off"
-    together = Deviation(f"every pad {size}, each in a random direction", hold["random_rms_mm"], hold["random_rms_mm"])
+    together = Deviation(
+        f"every pad {size}, each in a random direction", hold["random_rms_mm"], hold["random_model_rms_mm"]
+    )
     alone = [
         Deviation(f"pad {p['point']} alone {size}, towards ({_direction(p['direction'])})", error, p["model_rms_mm"])
         for p, error in zip(hold["points"], point_errors(sensitivity), strict=True)
@@ -59,9 +65,9 @@ def deviations(sensitivity: Mapping[str, Any]) -> list[list[Deviation]]:
     return [[together], alone, _force_deviations(sensitivity["force"]), *moduli]
 
 
-def point_errors(sensitivity: Mapping[str, Any]) -> list[float]:
+def point_errors(sensitivity: Mapping[str, Any]) -> list[float | None]:
     """RMS error, mm, with each pad alone off in its worst direction: simulated where it was, else by the model."""
-    return [p["model_rms_mm"] if p["rms_mm"] is None else p["rms_mm"] for p in sensitivity["hold"]["points"]]
+    return [p["rms_mm"] if p["simulated"] else p["model_rms_mm"] for p in sensitivity["hold"]["points"]]
 
 
 def warnings(sensitivity: Mapping[str, Any] | None) -> list[str]:
@@ -70,7 +76,9 @@ def warnings(sensitivity: Mapping[str, Any] | None) -> list[str]:
         return []
     if not sensitivity["stable"]:
         return ["UNSTABLE: the part would not stay in this shape, or not in the one that it springs back to."]
-    return [DO_NOT_HANG_WEIGHTS] if sensitivity["instability"]["dead_loads"] else []
+    moved = [sensitivity["hold"]["random_rms_mm"], *point_errors(sensitivity)]
+    hardly = [HARDLY_STABLE] if None in moved else []
+    return hardly + ([DO_NOT_HANG_WEIGHTS] if sensitivity["instability"]["dead_loads"] else [])
 
 
 def _force_deviations(force: Mapping[str, Any]) -> list[Deviation]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import face_table
-from fab4d.report.careful import Deviation, deviations, is_measured, warnings
+from fab4d.report.careful import JUMPS, Deviation, deviations, is_measured, warnings
 from fab4d.report.metrics import Shapes, final_as_wanted
 from fab4d.report.verdict import ACCEPTED, Check
 from fab4d.report.wording import plain
@@ -169,7 +169,8 @@ def _careful(sensitivity: Mapping[str, Any] | None) -> str:
     head = '<tr><th>what is off</th><th class="number">RMS error, mm</th><th class="number">by the model</th></tr>'
     note = (
         "RMS error of the finished shape with the equilibria solved anew; the model is of second order in the held "
-        "positions about the designed ones, and stands in for all pads but the worst two and for random directions."
+        "positions about the designed ones. Where it holds for the worst two pads, it stands in for the others and for "
+        f"random directions. {JUMPS.capitalize()}: no such shape was found near the designed one."
     )
     return f"{_warnings(sensitivity)}<table>{head}{rows}</table><p>{note}</p>"
 

@@ -1,7 +1,7 @@
 """The rig sheet as a PDF: page 1 is enough at the bench, page 2 has the large views and what to know."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,10 @@ TITLE_WIDTH = 56.0
 """Of a view, mm of paper."""
 FOOT = 12.0
 """Height kept free at the foot of a page for the boxes to sign, mm."""
+LINE = 5.0
+"""Of text with what is above it, mm: `Page.need` asks for room before it writes."""
+LOWEST_VIEWS, HIGHEST_VIEWS = 58.0, 100.0
+"""Of the row on the first page, mm."""
 MOST_DEVIATIONS = 4
 """Of those that need care, on the sheet."""
 
@@ -85,8 +89,8 @@ def rig_sheet(
     buffer = io.BytesIO()
     canvas = Canvas(buffer, pagesize=A4, invariant=1, pageCompression=1)
     canvas.setTitle(printable(f"Rig sheet: {name}"))
-    _bench_page(canvas, name, plan, figure, reasons, sensitivity)
-    _drawing_page(canvas, name, plan, figure)
+    has_checks = _bench_page(canvas, name, plan, figure, reasons, sensitivity)
+    _drawing_page(canvas, name, plan, figure, not has_checks)
     canvas.save()
     return buffer.getvalue()
 
@@ -98,28 +102,50 @@ def _bench_page(
     figure: Figure,
     reasons: list[str],
     sensitivity: Mapping[str, Any] | None,
-) -> None:
+) -> bool:
+    """Returns whether it has room for the caliper checks."""
     page = Page(canvas, HEIGHT - MARGIN - 4)
     _title(page, f"Rig sheet: {name}", "mm, N; frame of the printed part (that of the STL and 3MF files)")
     alerts = [f"NOT POSSIBLE ON THIS RIG: {reason}" for reason in reasons] + warnings(sensitivity)
     for words in alerts:
         page.alert(words)
     page.y -= 2
-    _views_in_a_row(page, plan, figure, max(60.0, 92.0 - 4.0 * max(0, plan.points.count + len(alerts) - 8)))
+    room = page.y - MARGIN - FOOT - LINE - _height(lambda page: _bench_words(page, plan, sensitivity))
+    checks = _height(lambda page: _check_table(page, plan))
+    has_checks = room - checks >= LOWEST_VIEWS
+    _views_in_a_row(page, plan, figure, float(np.clip(room - checks * has_checks, LOWEST_VIEWS, HIGHEST_VIEWS)))
+    _bench_words(page, plan, sensitivity)
+    if has_checks:
+        _check_table(page, plan)
+    _sign_boxes(page)
+    canvas.showPage()
+    return has_checks
+
+
+def _bench_words(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | None) -> None:
+    """What stands below the views of the first page, but for the caliper checks."""
+    _legend(page)
     _point_table(page, plan, sensitivity)
     _careful_table(page, sensitivity)
     _clamp_lines(page, plan)
     _schedule_lines(page, plan)
-    _check_table(page, plan)
-    _sign_boxes(page)
-    canvas.showPage()
 
 
-def _drawing_page(canvas: Canvas, name: str, plan: RigPlan, figure: Figure) -> None:
+def _height(write: Callable[[Page], None]) -> float:
+    """Height of what `write` writes on a page, mm: it is written on one without end."""
+    endless = Page(Canvas(io.BytesIO()), 1e5)
+    write(endless)
+    return 1e5 - endless.y
+
+
+def _drawing_page(canvas: Canvas, name: str, plan: RigPlan, figure: Figure, with_checks: bool) -> None:
     page = Page(canvas, HEIGHT - MARGIN - 4)
     _title(page, f"{name}: views and notes", "")
+    if with_checks:
+        _check_table(page, plan)
     page.y -= 2
-    _views_large(page, plan, figure, 168.0)
+    _views_large(page, plan, figure, 140.0 if with_checks else 168.0)
+    _legend(page)
     page.heading("How far to trust the numbers")
     for words in _trust(plan):
         page.paragraph(words)
@@ -148,7 +174,6 @@ def _views_in_a_row(page: Page, plan: RigPlan, figure: Figure, height: float) ->
         room = (left, page.y, width, scale * tallest + 2 * VIEW_MARGIN + 4)
         draw_view(page.canvas, plan, figure, projection, room, scale)
         left += width
-    _legend(page)
 
 
 def _column_widths(sizes: list[float], scale: float) -> list[float]:
@@ -179,7 +204,6 @@ def _views_large(page: Page, plan: RigPlan, figure: Figure, height: float) -> No
     page.y -= low
     draw_view(page.canvas, plan, figure, front, (MARGIN, page.y, left, low), scale)
     draw_view(page.canvas, plan, figure, side, (MARGIN + left, page.y, FULL - left, low), scale)
-    _legend(page)
 
 
 def _legend(page: Page) -> None:
@@ -229,7 +253,8 @@ def _point_table(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | Non
         ("kgf", 12.0, "r"),
         ("1 mm off*", 14.0, "r"),
     ]
-    off = [significant(e) for e in point_errors(sensitivity)] if is_measured(sensitivity) else [""] * p.count
+    errors = point_errors(sensitivity) if is_measured(sensitivity) else []
+    off = ["jumps" if error is None else significant(error) for error in errors] or [""] * p.count
     rows = [
         [
             str(k + 1),

@@ -23,8 +23,9 @@ from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages.monitor import Monitor
 
 HOLD_MM, FORCE_CHANGE, MODULUS_CHANGE = 1.0, 0.05, 0.1
-# Points whose worst move is simulated; for the others a quadratic model of the error tells it.
-SIMULATED_POINTS = 2
+# Points whose worst move is simulated first. Where the quadratic model of the error is off by more than MODEL_ERROR
+# there, everything is simulated, random moves by so many that come in pairs of opposite ones.
+SIMULATED_POINTS, MODEL_ERROR, RANDOM_MOVES = 2, 0.2, 4
 ELEMENTS = {1: "linear", 2: "quadratic"}
 
 
@@ -117,16 +118,42 @@ def _rms_mm(equilibria: Equilibria, design: Design | None) -> float | None:
 def _hold_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
     """Each point moved in its own worst direction; all points in random ones."""
     L0, count = equilibria.problem.length, equilibria.patches.count
-    moves = [_alone(count, point, response.worst_move(point, HOLD_MM / L0)) for point in range(count)]
-    expected = [response.rms_after(dc) * L0 for dc in moves]
-    simulated: list[float | None] = [None] * count
-    for point in np.argsort(expected)[::-1][:SIMULATED_POINTS]:
-        simulated[point] = _rms_mm(equilibria, with_moved_points(equilibria, design, response, moves[point]))
+    size = HOLD_MM / L0
+
+    def simulated(dc: np.ndarray) -> float | None:
+        return _rms_mm(equilibria, with_moved_points(equilibria, design, response, dc))
+
+    moves = [_alone(count, point, response.worst_move(point, size)) for point in range(count)]
+    told = [response.rms_after(dc) * L0 for dc in moves]
+    worst_first = np.argsort(told)[::-1]
+    found = {k: simulated(moves[k]) for k in worst_first[:SIMULATED_POINTS]}
+    holds = all(rms is not None and abs(told[k] - rms) <= MODEL_ERROR * rms for k, rms in found.items())
+    random_model_rms = response.expected_rms(size) * L0
+    random_rms: float | None = random_model_rms
+    if not holds:
+        found |= {k: simulated(moves[k]) for k in worst_first[SIMULATED_POINTS:]}
+        random_rms = _root_mean_square([simulated(dc) for dc in _random_moves(count, size)])
     points = [
-        {"point": k + 1, "direction": (dc[k] * L0 / HOLD_MM).tolist(), "model_rms_mm": by_model, "rms_mm": found}
-        for k, (dc, by_model, found) in enumerate(zip(moves, expected, simulated, strict=True))
+        {"point": k + 1, "direction": (moves[k][k] / size).tolist(), "model_rms_mm": told[k]}
+        | {"simulated": k in found, "rms_mm": found.get(k)}
+        for k in range(count)
     ]
-    return {"change_mm": HOLD_MM, "random_rms_mm": response.expected_rms(HOLD_MM / L0) * L0, "points": points}
+    random = {"random_rms_mm": random_rms, "random_model_rms_mm": random_model_rms}
+    return {"change_mm": HOLD_MM, "model_holds": holds, **random, "points": points}
+
+
+def _random_moves(count: int, size: float) -> list[np.ndarray]:
+    """Moves (K, 3) of all points by `size` in random directions, each followed by its opposite."""
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((RANDOM_MOVES // 2, count, 3))
+    directions *= size / np.linalg.norm(directions, axis=2, keepdims=True)
+    return [sign * dc for dc in directions for sign in (1, -1)]
+
+
+def _root_mean_square(values: list[float | None]) -> float | None:
+    """None where one is missing."""
+    known = [v for v in values if v is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) == len(values) else None
 
 
 def _alone(count: int, point: int, change: np.ndarray) -> np.ndarray:

@@ -33,9 +33,12 @@ def sensitivity_report() -> dict[str, Any]:
         "rms_mm": 0.15,
         "hold": {
             "change_mm": 1.0,
+            "model_holds": True,
             "random_rms_mm": 1.25,
+            "random_model_rms_mm": 1.25,
             "points": [
-                {"point": k, "direction": [0.0, -0.6, 0.8], "model_rms_mm": model, "rms_mm": rms}
+                {"point": k, "direction": [0.0, -0.6, 0.8], "model_rms_mm": model}
+                | {"simulated": rms is not None, "rms_mm": rms}
                 for k, (model, rms) in enumerate(pads, 1)
             ],
         },

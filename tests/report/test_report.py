@@ -99,7 +99,7 @@ def test_sensitivity_is_told_on_the_page(result, sensitivity):
     page = result["report_html"].decode()
     assert '<p class="warning">HOLD POSITIONS, DO NOT HANG WEIGHTS' in page
     for what, rms, model in (
-        ("pads set by force gauge, all forces 5 % smaller", "no such shape", "0.6"),
+        ("pads set by force gauge, all forces 5 % smaller", "jumps away", "0.6"),
         ("pad 1 alone 1 mm off, towards (0.00 -0.60 0.80)", "0.500", "0.5"),
         ("pad 2 alone 1 mm off, towards (0.00 -0.60 0.80)", "0.800", "0.9"),
         ("hot SMP 10 % stiffer than its card says (forces 10 % larger)", "0.300", ""),

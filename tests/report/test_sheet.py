@@ -147,7 +147,7 @@ def test_sheet_says_what_must_be_done_carefully(bar, rig_run, sensitivity):
     assert [line for line in lines[start + 3 : start + 13 : 2] if line][1:] == [
         next(line for line in lines if words in line) for words in off
     ]
-    assert lines[start + 4 : start + 13 : 2] == ["0.150", "no such shape", "1.25", "0.800", "0.300"]
+    assert lines[start + 4 : start + 13 : 2] == ["0.150", "jumps away", "1.25", "0.800", "0.300"]
     for error in ("0.500", "0.800", "0.750"):
         assert error in lines[:start]
 
@@ -158,6 +158,8 @@ def test_sheet_without_sensitivity_has_no_care_and_no_warning(bar, rig_run, sens
     assert "DO NOT HANG WEIGHTS" not in plain
     sensitivity["instability"]["dead_loads"] = 0
     assert "DO NOT HANG WEIGHTS" not in pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"])
+    sensitivity["hold"]["random_rms_mm"] = None
+    assert "HARDLY STABLE" in pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"])
     unstable = {"stable": False, "left_out": [], "reasons": ["it snaps"]}
     assert "UNSTABLE" in pdf_text(rig_run(bar.state_artifact(), sensitivity=unstable)["rig_sheet"])
 
