@@ -164,6 +164,17 @@ def test_sheet_without_sensitivity_has_no_care_and_no_warning(bar, rig_run, sens
     assert "UNSTABLE" in pdf_text(rig_run(bar.state_artifact(), sensitivity=unstable)["rig_sheet"])
 
 
+def test_checks_go_to_the_second_page_where_the_first_is_full(bar, rig_run, sensitivity, monkeypatch):
+    def order(words):
+        text = pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"])
+        return [text.count(words), text.index(words) < text.index("views and notes")]
+
+    assert order("Caliper checks") == [1, True]
+    monkeypatch.setattr(sheet, "LOWEST_VIEWS", 98.0)
+    assert order("Caliper checks") == [1, False]
+    assert rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"].count(b"/Type /Page\n") == 2
+
+
 def test_nothing_to_program_gives_no_sheet(bar, rig_run):
     state = bar.state_artifact()
     state |= {"patch_center": state["patch_center"][:0], "patch_force": np.zeros((0, 3))}
