@@ -111,6 +111,18 @@ class Linearisation:
         lz = self.held.solve(rhs)
         return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:].reshape(-1, 3)
 
+    def adjoint_many(self, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients with respect to rho (m, q) and held positions (3K, q) of functions of y with gradients gy (3N, q)."""
+        n = self.M.shape[0]
+        b = gy.copy()
+        b[self.free_fixed] = 0.0
+        ly = self.free.solve_many(b)
+        rhs = np.zeros((n + 3 * self.n_patches, gy.shape[1]))
+        rhs[:n] = -(self.MT @ ly)
+        rhs[self.held_fixed] = 0.0
+        lz = self.held.solve_many(rhs)
+        return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:]
+
     def held_columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """dx/dc, df/dc, dy/dc as (3N, 3K), (3K, 3K), (3N, 3K)."""
         n, k = self.M.shape[0], 3 * self.n_patches

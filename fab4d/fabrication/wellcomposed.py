@@ -9,10 +9,12 @@ search ends. What it leaves, if anything, is removed by flips of one label only,
 at the worst one material is left.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from fab4d.fabrication._links import Links, links_of, split_fans
-from fab4d.fabrication._repair_kernels import FREE, Queue, Scratch, State, all_defects, search
+from fab4d.fabrication._repair_kernels import FREE, Queue, Scratch, State, all_defects, harmless_flip, search
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 LONGEST_EXCURSION = 50
@@ -46,6 +48,17 @@ def well_composed(tets: IntArray, smp: BoolArray, flip_cost: FloatArray) -> Bool
     if not state.defects.any() or search(state, links, scratch, _queue(links), _trail(scratch)) == 0:
         return state.smp
     return _one_way(state, links, scratch)
+
+
+def flip_check(tets: IntArray) -> Callable[[BoolArray, int], bool]:
+    """A function of labels (m,) and a tet that tells whether flipping the tet pinches no boundary.
+
+    The tables of the mesh `tets` (m, 4) are built once.
+    """
+    links = links_of(split_fans(tets))
+    scratch = _scratch(links)
+    nowhere = np.zeros(len(links.n_nodes), bool)
+    return lambda smp, tet: bool(harmless_flip(tet, nowhere, smp, links, scratch))
 
 
 def _one_way(state: State, links: Links, scratch: Scratch) -> BoolArray:

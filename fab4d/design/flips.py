@@ -1,0 +1,210 @@
+"""Single labels that are changed so that the printed design comes nearer to the temporary shape.
+
+Rounding a density and mending its labels costs accuracy. Sensitivities of the error's smooth part with respect to every
+density cost a few back-substitutions, and tell which flips at the interface win it back together; the held positions
+follow. Each round of flips is judged by the equilibria of the labels that result from it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.gauss_newton import Design, Model, build_model, evaluate
+from fab4d.design.objective import ObjectiveWeights, rigid_modes, shape_error, smoothness_matrix
+from fab4d.design.problem import Problem
+from fab4d.design.reduced import Search, Watch, change_density, refit
+from fab4d.errors import EquilibriumError
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+# The error is followed in polynomials of this degree, and in the error's own direction.
+MODE_DEGREE = 3
+FIRST_BATCH, LARGEST_BATCH = 40, 200
+# A flip has to lower the predicted squared error by this share of it, a round the objective by this one.
+LEAST_GAIN, LEAST_ROUND_GAIN = 1e-3, 1e-2
+# A whole flip changes the shape by another amount than the derivative says: less when stiff SMP comes in, more when it
+# goes. The first guesses are corrected by each round.
+FIRST_FACTORS = (0.25, 1.0)
+FACTOR_BOUNDS = ((0.03, 0.6), (0.3, 4.0))
+HELD_RIDGE = 1e-4
+
+Printable = Callable[[BoolArray], BoolArray]
+Flippable = Callable[[BoolArray, int], bool]
+
+
+@dataclass(frozen=True)
+class FlipSettings:
+    """printable : labels near the given ones that can be printed
+    flippable : whether the flip of one tet of the given labels pinches nothing
+
+    target_rms : RMS error, L0, at which nothing more is to be won        max_smp_fraction : of the volume
+    """
+
+    printable: Printable
+    flippable: Flippable
+    target_rms: float
+    max_smp_fraction: float = 1.0
+    rounds: int = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModes:
+    """The error as amplitudes (q,) of modes, and how density and held positions change them.
+
+    directions (3N, q) : gradients of the amplitudes with respect to the final shape
+    by_density (m, q), by_held (3K, q) : of the amplitudes with respect to rho and to the held positions
+    """
+
+    directions: FloatArray
+    amplitudes: FloatArray
+    by_density: FloatArray
+    by_held: FloatArray
+
+
+def polish_labels(
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, settings: FlipSettings, watch: Watch
+) -> Design:
+    """The design with labels flipped at the interface as long as that brings it nearer to X_temp.
+
+    design : of 0/1 labels, held positions fitted to them; the result is such a design too
+    """
+    L = smoothness_matrix(equilibria.problem)
+    plain = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
+    value = evaluate(equilibria, plain, L, design)
+    factors, batch, poor = np.array(FIRST_FACTORS), FIRST_BATCH, 0
+    for _ in range(settings.rounds):
+        if poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
+            break
+        modes = error_modes(equilibria.problem, build_model(equilibria, plain, L, design), design)
+        flips = choose_flips(equilibria.problem, modes, design.rho, factors, settings, batch)
+        if not len(flips):
+            break
+        trial = _flipped(equilibria, design, flips, plain, settings)
+        if trial is None:
+            batch, poor = max(batch // 3, 1), poor + 1
+            continue
+        printed, fitted = trial
+        factors = _corrected(factors, modes, design, printed, equilibria.problem)
+        new = evaluate(equilibria, plain, L, fitted)
+        poor = poor + 1 if new > (1 - LEAST_ROUND_GAIN) * value else 0
+        batch = min(batch * 3 // 2, LARGEST_BATCH) if new < value else max(batch // 3, 1)
+        if new < value:
+            design, value = fitted, new
+            watch(Search(equilibria, design))
+    return design
+
+
+def _flipped(
+    equilibria: Equilibria, design: Design, flips: IntArray, weights: ObjectiveWeights, settings: FlipSettings
+) -> tuple[Design, Design] | None:
+    """The design with these tets flipped and made printable, before and after fitting the held positions."""
+    labels = design.rho > 0.5
+    labels[flips] = ~labels[flips]
+    try:
+        printed = change_density(equilibria, design, settings.printable(labels).astype(np.float64))
+    except EquilibriumError:
+        return None
+    return printed, refit(equilibria, printed, weights, lambda at: None, iterations=4)  # noqa: ARG005
+
+
+# -- sensitivities
+
+
+def error_modes(problem: Problem, model: Model, design: Design) -> ErrorModes:
+    """Amplitudes of the error of the final shape and their sensitivities, from the model at the design."""
+    error = shape_error(problem, design.final.y)
+    e = (error.e @ error.R).ravel()
+    weights = np.repeat(problem.area_weights, 3)
+    outer = np.flatnonzero(weights)
+    root = np.sqrt(weights[outer])[:, None]
+    modes = np.column_stack([e, _polynomials(problem.body.X, MODE_DEGREE)])[outer]
+    rigid, _ = np.linalg.qr(root * rigid_modes(design.final.y).reshape(-1, 6)[outer])
+    basis = root * modes
+    for _ in range(2):  # twice is enough for orthogonality to rounding
+        basis -= rigid @ (rigid.T @ basis)
+    basis, r = np.linalg.qr(basis)
+    size = np.abs(np.diag(r))
+    directions = np.zeros((len(e), int((size > 1e-10 * size.max()).sum())))
+    directions[outer] = root * basis[:, size > 1e-10 * size.max()]
+    by_density, by_held = model.lin.adjoint_many(directions)
+    return ErrorModes(directions, directions.T @ e, by_density, by_held)
+
+
+def _polynomials(X: FloatArray, degree: int) -> FloatArray:
+    """(3N, q) vector fields: each monomial of X (N, 3) up to the degree in each of the three components."""
+    centred = (X - X.mean(axis=0)) / np.abs(X - X.mean(axis=0)).max()
+    powers = [c for d in range(degree + 1) for c in combinations_with_replacement(range(3), d)]
+    monomials = np.column_stack([centred[:, c].prod(axis=1) if c else np.ones(len(X)) for c in map(list, powers)])
+    return np.kron(monomials, np.eye(3))
+
+
+# -- choice
+
+
+def choose_flips(
+    problem: Problem, modes: ErrorModes, rho: FloatArray, factors: FloatArray, settings: FlipSettings, most: int
+) -> IntArray:
+    """Tets at the interface whose flips, one after the other, lower the predicted error most, held positions following.
+
+    factors : (2,) how much of the derivative a whole flip to SMP and one to TPE is worth
+    """
+    labels = rho > 0.5
+    tets = np.flatnonzero(at_interface(problem, labels))
+    change, residual = _predicted(modes, tets, np.where(labels[tets], -factors[1], factors[0]))
+    own, usable, chosen = (change**2).sum(axis=1), np.ones(len(tets), bool), []
+    volumes = problem.volume_fractions[tets]
+    while len(chosen) < most:
+        room = settings.max_smp_fraction - problem.volume_fractions @ labels
+        allowed = usable & at_interface(problem, labels)[tets] & (labels[tets] | (volumes <= room))
+        gain = np.where(allowed, -2 * change @ residual - own, 0.0)
+        worth = np.flatnonzero(gain > LEAST_GAIN * (residual @ residual))
+        ranked = worth[np.argsort(-gain[worth])]
+        best = next((k for k in ranked if settings.flippable(labels, int(tets[k]))), None)
+        if best is None:
+            break
+        chosen.append(tets[best])
+        residual = residual + change[best]
+        labels[tets[best]], usable[best] = not labels[tets[best]], False
+    return np.array(chosen, np.int64)
+
+
+def _predicted(modes: ErrorModes, tets: IntArray, by: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Changes (k, q) of the amplitudes when the density of `tets` changes `by` (k,), and the amplitudes (q,), both
+    without what the held positions take away."""
+    change, follow = modes.by_density[tets] * by[:, None], _held_follow(modes.by_held)
+    rest = modes.amplitudes - follow @ (modes.by_held @ modes.amplitudes)
+    return change - (change @ modes.by_held.T) @ follow.T, rest
+
+
+def _held_follow(by_held: FloatArray) -> FloatArray:
+    """(q, 3K) maps H^T v to the part of v (q,) that held positions take away: H^T (H H^T + ridge)^-1."""
+    k = len(by_held)
+    if k == 0:
+        return by_held.T
+    gram = by_held @ by_held.T
+    return np.linalg.solve(gram + HELD_RIDGE * np.trace(gram) / k * np.eye(k), by_held).T
+
+
+def at_interface(problem: Problem, labels: BoolArray) -> BoolArray:
+    """(m,) tets with a face between SMP and TPE."""
+    first, second = problem.neighbours.T
+    between = labels[first] != labels[second]
+    result = np.zeros(len(labels), bool)
+    result[first[between]] = True
+    result[second[between]] = True
+    return result
+
+
+def _corrected(
+    factors: FloatArray, modes: ErrorModes, before: Design, after: Design, problem: Problem
+) -> FloatArray:
+    """Factors halfway to those that explain what the flips really changed."""
+    error = shape_error(problem, after.final.y)
+    moved = modes.directions.T @ (error.e @ error.R).ravel() - modes.amplitudes
+    step = (after.rho - before.rho)[:, None] * modes.by_density
+    columns = np.column_stack([step[after.rho > before.rho].sum(axis=0), step[after.rho < before.rho].sum(axis=0)])
+    found = np.linalg.lstsq(columns, moved, rcond=None)[0]
+    low, high = np.transpose(FACTOR_BOUNDS)
+    return np.clip(0.5 * (factors + found), low, high)
