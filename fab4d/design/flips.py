@@ -6,10 +6,11 @@ follow. Each round of flips is judged by the equilibria of the labels that resul
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
+from scipy.linalg import qr
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design, Model, build_model, evaluate
@@ -119,15 +120,17 @@ def error_modes(problem: Problem, model: Model, design: Design) -> ErrorModes:
     weights = np.repeat(problem.area_weights, 3)
     outer = np.flatnonzero(weights)
     root = np.sqrt(weights[outer])[:, None]
-    modes = np.column_stack([e, _polynomials(problem.body.X, MODE_DEGREE)])[outer]
+    modes = np.column_stack([e / np.abs(e).max(), _polynomials(problem.body.X, MODE_DEGREE)])[outer]
     rigid, _ = np.linalg.qr(root * rigid_modes(design.final.y).reshape(-1, 6)[outer])
     basis = root * modes
     for _ in range(2):  # twice is enough for orthogonality to rounding
         basis -= rigid @ (rigid.T @ basis)
-    basis, r = np.linalg.qr(basis)
+    # The fields are not independent on the few vertices of a coarse mesh.
+    basis, r, _ = qr(basis, mode="economic", pivoting=True)
     size = np.abs(np.diag(r))
-    directions = np.zeros((len(e), int((size > 1e-10 * size.max()).sum())))
-    directions[outer] = root * basis[:, size > 1e-10 * size.max()]
+    basis = basis[:, size > 1e-6 * size[0]]
+    directions = np.zeros((len(e), basis.shape[1]))
+    directions[outer] = root * basis
     by_density, by_held = model.lin.adjoint_many(directions)
     return ErrorModes(directions, directions.T @ e, by_density, by_held)
 
@@ -153,7 +156,8 @@ def choose_flips(
     labels = rho > 0.5
     tets = np.flatnonzero(at_interface(problem, labels))
     change, residual = _predicted(modes, tets, np.where(labels[tets], -factors[1], factors[0]))
-    own, usable, chosen = (change**2).sum(axis=1), np.ones(len(tets), bool), []
+    own, usable = (change**2).sum(axis=1), np.ones(len(tets), bool)
+    chosen: list[int] = []
     volumes = problem.volume_fractions[tets]
     while len(chosen) < most:
         room = settings.max_smp_fraction - problem.volume_fractions @ labels
@@ -197,9 +201,7 @@ def at_interface(problem: Problem, labels: BoolArray) -> BoolArray:
     return result
 
 
-def _corrected(
-    factors: FloatArray, modes: ErrorModes, before: Design, after: Design, problem: Problem
-) -> FloatArray:
+def _corrected(factors: FloatArray, modes: ErrorModes, before: Design, after: Design, problem: Problem) -> FloatArray:
     """Factors halfway to those that explain what the flips really changed."""
     error = shape_error(problem, after.final.y)
     moved = modes.directions.T @ (error.e @ error.R).ravel() - modes.amplitudes

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.gauss_newton import Design, equilibrate, evaluate, gauss_newton_step, held_positions
-from fab4d.design.objective import ObjectiveWeights, smoothness_matrix
+from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
@@ -19,6 +19,8 @@ START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
 FIRST_DAMPING, LARGEST_DAMPING = 0.3, 30.0
 FIRST_LAM_ROUND = 0.02
+# While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
+ROUNDING_LOSS = 2.5
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 
@@ -49,7 +51,7 @@ class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
     phase : of the next step        iteration, slow : steps of this phase, and how many of the last gained little
-    accepted : whether the last step found a better design
+    accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
     """
 
     equilibria: Equilibria
@@ -61,6 +63,7 @@ class Search:
     iteration: int = 0
     slow: int = 0
     accepted: bool = True
+    relaxed_rms: float = np.inf
 
 
 Watch = Callable[[Search], None]
@@ -145,7 +148,9 @@ def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     slow = at.slow + 1 if step.value > 0.98 * value else 0
     after = replace(at, design=step.design, damping=step.damping, accepted=step.accepted, slow=slow)
     if not step.accepted or slow == 2 or at.iteration + 1 == settings.relax_iterations:
-        return replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, iteration=0, slow=0)
+        rms = shape_error(at.equilibria.problem, step.design.final.y).rms
+        rounding = replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, relaxed_rms=rms)
+        return replace(rounding, iteration=0, slow=0)
     return replace(after, iteration=at.iteration + 1)
 
 
@@ -153,7 +158,9 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Raise lam_round until all but a few densities are 0 or 1, held positions following."""
     too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
     lam_SMP = 1.5 * at.lam_SMP if too_much else at.lam_SMP
-    weights = settings.weights.replace(lam_SMP=lam_SMP, lam_round=at.lam_round)
+    # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
+    scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
+    weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
     finished = (
         undecided_fraction(step.design.rho) <= settings.undecided_fraction
@@ -213,7 +220,7 @@ def refit(
         step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed, tries=12)
         if not step.accepted:
             break
-        slow = step.value > (1 - 1e-4) * value
+        slow = step.value > (1 - 1e-3) * value
         design, damping, value = step.design, step.damping, step.value
         watch(Search(equilibria, design, Phase.DONE))
         if slow:

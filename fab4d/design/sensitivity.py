@@ -112,7 +112,7 @@ class Linearisation:
         return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:].reshape(-1, 3)
 
     def adjoint_many(self, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradients with respect to rho (m, q) and held positions (3K, q) of functions of y with gradients gy (3N, q)."""
+        """Gradients with respect to rho (m, q) and held positions (3K, q) of q functions with gradients gy (3N, q)."""
         n = self.M.shape[0]
         b = gy.copy()
         b[self.free_fixed] = 0.0

@@ -74,10 +74,7 @@ def newton(
         if at.norm <= tolerance * at.scale:
             return Solution(z, Status.CONVERGED, at.norm / at.scale, iteration, guarded)
         try:
-            tangent = factor(z)
-            if fallback is not None and tangent.n_negative > n_negative:
-                tangent = fallback(z)
-            step = -tangent.solve(at.r)
+            step = -_usable(factor, fallback, z, n_negative).solve(at.r)
         except SingularMatrixError:
             return Solution(z, Status.SINGULAR, at.norm / at.scale, iteration, guarded)
         t, slope = 1.0, float(at.r @ step)
@@ -93,6 +90,22 @@ def newton(
         z, at = ahead, new
     status = Status.CONVERGED if at.norm <= tolerance * at.scale else Status.MAX_ITERATIONS
     return Solution(z, status, at.norm / at.scale, max_iterations, guarded)
+
+
+def _usable(
+    factor: Callable[[FloatArray], Factor],
+    fallback: Callable[[FloatArray], Factor] | None,
+    z: FloatArray,
+    n_negative: int,
+) -> Factor:
+    """The factor at z, or the fallback where it has other negative eigenvalues than it should, or is singular."""
+    if fallback is None:
+        return factor(z)
+    try:
+        tangent = factor(z)
+    except SingularMatrixError:
+        return fallback(z)
+    return fallback(z) if tangent.n_negative > n_negative else tangent
 
 
 def _improves(new: Residual, old: Residual, t: float, slope: float, tolerance: float) -> bool:

@@ -12,7 +12,7 @@ from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
 from fab4d.io.scene import RigCard
 
-_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow")
+_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow", "relaxed_rms")
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:
@@ -40,7 +40,6 @@ def search_from(problem: Problem, rig: RigCard, saved: Mapping[str, np.ndarray])
     if design is None:
         msg = "a saved state of the solver is not in equilibrium: run again with --force"
         raise ArtifactError(msg)
-    lam_SMP, lam_round, damping, iteration, slow = saved["numbers"].tolist()
-    return Search(
-        equilibria, design, Phase(str(saved["phase"])), lam_SMP, lam_round, damping, int(iteration), int(slow)
-    )
+    numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
+    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow")}
+    return Search(equilibria, design, Phase(str(saved["phase"])), **numbers)

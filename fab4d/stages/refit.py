@@ -1,11 +1,12 @@
 """Stage `refit`: the held positions that are best for the labels that will be printed."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
+from fab4d.design.flips import FlipSettings, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import ObjectiveWeights
@@ -13,13 +14,17 @@ from fab4d.design.patches import Patches
 from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
-from fab4d.mesh.measures import face_area_vectors
+from fab4d.fabrication.labels import smp_clusters
+from fab4d.fabrication.wellcomposed import flip_check
+from fab4d.mesh.measures import face_area_vectors, tet_volumes
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
 from fab4d.stages.monitor import Monitor
+from fab4d.stages.threshold import labels_for
 
 # How often the held positions are fitted again after the loading has found another equilibrium than the fit.
 MOST_FITS = 3
+Polish = Callable[[Design], Design]
 LEFT_OUT = {
     "linear": [
         {
@@ -44,15 +49,24 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     fits = 0
     if equilibria.patches.count:
         weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
-        design, fits = _reachable_fit(equilibria, design, weights, trace)
+        polish = _polish(inputs, profile, equilibria, weights, trace)
+        design, fits = _reachable_fit(equilibria, design, weights, polish, trace)
+    smp = design.rho > 0.5
     design = polished(equilibria, design)
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
     reasons = _limit_reasons(problem, equilibria.patches, design, profile)
+    volumes = tet_volumes(mesh["X"], mesh["tets"])
+    report = {
+        "fits": fits,
+        "flipped_fraction": float(problem.volume_fractions[smp != rounded["smp"]].sum()),
+        "reasons": reasons,
+        "left_out": LEFT_OUT[element],
+    }
     return {
-        "labels": dict(rounded),
+        "labels": {"smp": smp, "cluster": smp_clusters(mesh["tets"], volumes, smp)},
         "printed": printed,
-        "refit_report": {"fits": fits, "reasons": reasons, "left_out": LEFT_OUT[element]},
+        "refit_report": report,
         "refit_trace": trace.csv(),
     }
 
@@ -70,17 +84,36 @@ def _programmed(done: Programming, smp: FloatArray) -> Design:
 
 
 def _reachable_fit(
-    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, trace: Trace
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, polish: Polish, trace: Trace
 ) -> tuple[Design, int]:
-    """Fit the held positions; again from where loading ends while that is elsewhere. Returns the fits made too."""
+    """Fit positions and labels; again from where loading ends while that is elsewhere. Returns the fits made too."""
     for fit in range(1, MOST_FITS + 1):
-        design = refit(equilibria, design, weights, lambda at: trace.add("refit", at))
+        design = polish(refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         if same_shape(done, design.median.x) or fit == MOST_FITS:
             return design, fit
         design = _programmed(done, design.rho)
         trace.add("reached", Search(equilibria, design))
     raise AssertionError  # the loop returns
+
+
+def _polish(
+    inputs: Mapping[str, Any],
+    profile: Mapping[str, Any],
+    equilibria: Equilibria,
+    weights: ObjectiveWeights,
+    trace: Trace,
+) -> Callable[[Design], Design]:
+    """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
+    X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
+    limit = profile["goal"].max_smp_fraction
+    settings = FlipSettings(
+        printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), profile["printer"]).smp,
+        flippable=flip_check(tets),
+        target_rms=float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length,
+        max_smp_fraction=1.0 if limit is None else limit,
+    )
+    return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:

@@ -100,7 +100,12 @@ def _settings(problem: Problem, profile: Mapping[str, Any], attempt: int) -> Red
 
 def _artifacts(problem: Problem, found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:
     design = found.design
-    relaxed = {"rho": design.rho, "x": design.median.x * problem.length, "y": design.final.y * problem.length}
+    relaxed = {
+        "rho": design.rho,
+        "x": design.median.x * problem.length,
+        "y": design.final.y * problem.length,
+        "relaxed_rms": np.array(found.relaxed_rms * problem.length),
+    }
     return {
         "relaxed": relaxed | patch_arrays(problem, found.equilibria.patches, design),
         "solve_report": report,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
+from fab4d.fabrication.wellcomposed import flip_check, pinched_vertices, well_composed
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.topology import TET_FACES
 
@@ -40,6 +40,20 @@ def is_one_cycle(edges):
             seen.add(node)
             waiting += neighbours[node]
     return len(seen) == len(neighbours)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), n_points=st.integers(0, 40))
+def test_a_flip_that_is_allowed_pinches_nothing(meshes, seed, n_points):
+    X, tets = meshes["irregular"](n_points, seed)
+    smp = repaired(X, tets, np.random.default_rng(seed).random(len(tets)) < 0.5)
+    allowed, answers = flip_check(tets), []
+    for tet in range(0, len(tets), 7):
+        flipped = smp.copy()
+        flipped[tet] ^= True
+        answers.append(allowed(smp, tet))
+        assert answers[-1] == (pinched_by_hand(tets, flipped) == [])
+    assert allowed(smp, 0) == answers[0]
 
 
 def repaired(X, tets, smp):

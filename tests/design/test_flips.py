@@ -1,0 +1,117 @@
+"""Flipping labels after rounding: sensitivities against differences, and known labels found again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bars import TIGHT, bar, held_design, two_patches
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.flips import ErrorModes, FlipSettings, at_interface, choose_flips, error_modes, polish_labels
+from fab4d.design.gauss_newton import Design, build_model, equilibrate, held_positions
+from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
+from fab4d.design.problem import Problem
+from fab4d.mesh.rigid import best_rigid_motion
+
+WEIGHTS = ObjectiveWeights(error_scale=1e-3)
+FREELY = FlipSettings(printable=lambda smp: smp, flippable=lambda smp, tet: True, target_rms=0.0)  # noqa: ARG005
+
+
+def modes_at(equilibria: Equilibria, design: Design) -> ErrorModes:
+    L = smoothness_matrix(equilibria.problem)
+    return error_modes(equilibria.problem, build_model(equilibria, WEIGHTS, L, design), design)
+
+
+def amplitudes(problem: Problem, modes: ErrorModes, design: Design, reference: Design) -> np.ndarray:
+    """Of the modes at the reference, in its frame."""
+    error = shape_error(problem, design.final.y)
+    return modes.directions.T @ (error.e @ shape_error(problem, reference.final.y).R).ravel()
+
+
+def upper_half(problem: Problem) -> np.ndarray:
+    X = problem.body.X
+    return X[problem.body.elements].mean(axis=1)[:, 2] > 0.5 * X[:, 2].max()
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_sensitivities_of_the_amplitudes_are_their_derivatives(element: str) -> None:
+    problem = bar(cells=(3, 1, 1), degrees=25.0, element=element)
+    equilibria = two_patches(problem)
+    random = np.random.default_rng(1)
+    rho = random.uniform(0.3, 0.7, problem.n_tets)
+    design = held_design(equilibria, rho, problem.X_temp)
+    modes = modes_at(equilibria, design)
+    drho, dc = random.normal(size=problem.n_tets), random.normal(size=(2, 3))
+    expected = drho @ modes.by_density + 0.1 * dc.ravel() @ modes.by_held
+    h = 1e-5
+
+    def moved(sign: float) -> np.ndarray:
+        held = held_positions(equilibria, design.median) + sign * h * 0.1 * dc
+        x, f, y = design.median.x, design.median.forces, design.final.y
+        trial = equilibrate(equilibria, rho + sign * h * drho, held, x, f, y, TIGHT, 40)
+        assert trial is not None
+        return amplitudes(problem, modes, trial, design)
+
+    found = (moved(1.0) - moved(-1.0)) / (2 * h)
+    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+
+
+def test_the_amplitudes_hold_the_whole_error() -> None:
+    problem = bar(degrees=30.0)
+    equilibria = two_patches(problem)
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    modes = modes_at(equilibria, design)
+    assert np.linalg.norm(modes.amplitudes) == pytest.approx(shape_error(problem, design.final.y).rms, rel=1e-9)
+
+
+def test_labels_that_were_spoilt_are_made_good_again() -> None:
+    """The wanted shape is that of known labels; some are flipped, and the error they cause is flipped away."""
+    made = bar(cells=(6, 3, 2), degrees=40.0)
+    equilibria, smp = two_patches(made), upper_half(made)
+    truth = held_design(equilibria, smp.astype(float), made.X_temp)
+    problem = _wanting(made, truth)
+    at = Equilibria(problem, equilibria.patches)
+    spoilt = smp.copy()
+    spoilt[np.flatnonzero(at_interface(problem, smp))[::4]] ^= True
+    held = held_positions(equilibria, truth.median)
+    start = equilibrate(at, spoilt.astype(float), held, truth.median.x, truth.median.forces, truth.final.y)
+    assert start is not None
+    shown: list[float] = []
+    end = polish_labels(at, start, WEIGHTS, FREELY, lambda s: shown.append(shape_error(problem, s.design.final.y).rms))
+    before, after = (shape_error(problem, d.final.y).rms for d in (start, end))
+    assert after < 0.5 * before
+    assert set(np.unique(end.rho)) == {0.0, 1.0}
+    assert shown == sorted(shown, reverse=True)
+    assert shown[-1] == after
+
+
+def _wanting(made: Problem, design: Design) -> Problem:
+    """The problem whose temporary shape is what the design becomes."""
+    X, clamp = made.body.X, made.clamp
+    R, t = best_rigid_motion(design.final.y[clamp], X[clamp])
+    return replace(made, X_temp=design.final.y @ R.T + t)
+
+
+def test_nothing_is_flipped_at_the_target_or_where_nothing_may_be() -> None:
+    problem = bar(degrees=30.0)
+    equilibria = two_patches(problem)
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    for settings in (
+        FlipSettings(FREELY.printable, FREELY.flippable, target_rms=1.0),
+        FlipSettings(FREELY.printable, lambda smp, tet: False, target_rms=0.0),  # noqa: ARG005
+    ):
+        same = polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
+        np.testing.assert_array_equal(same.rho, design.rho)
+
+
+def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
+    problem = bar(degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    design = held_design(equilibria, smp.astype(float), problem.X_temp)
+    modes, factors = modes_at(equilibria, design), np.array([0.3, 1.0])
+    flips = choose_flips(problem, modes, design.rho, factors, FREELY, 30)
+    assert len(flips)
+    assert at_interface(problem, smp)[flips].all()
+    assert not smp[flips].all()
+    full = FlipSettings(FREELY.printable, FREELY.flippable, target_rms=0.0, max_smp_fraction=0.0)
+    assert smp[choose_flips(problem, modes, design.rho, factors, full, 30)].all()
