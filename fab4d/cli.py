@@ -6,6 +6,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -225,6 +226,7 @@ for _stage in stage_table().between("solve", "sensitivity"):
 @click.option("--labels", metavar="FIELD", help="Take MESH, a tet mesh, with this cell field: 1 is SMP, 0 is TPE.")
 @click.option("--units", help="Of MESH: mm if not given, cm, m or in.")
 @click.option("--printer", metavar="CARD", help="For MESH; generic-dual-0.4 if not given.")
+@click.option("--up", metavar="X,Y,Z", help="Direction of MESH that points up on the printer; 0,0,1 if not given.")
 @click.option("--materials", metavar="CARD", help="For MESH; paper-corrected if not given.")
 @click.option("--force", is_flag=True, help="Run bodies even where it is current.")
 @click.option("--quiet", is_flag=True, help="Show no progress.")
@@ -246,7 +248,7 @@ def bodies(scene: Path, out: Path | None, labels: str | None, force: bool, quiet
 
 
 def _labelled_workspace(
-    mesh: Path, out: Path | None, field: str, units: str = "mm", printer: str = "", materials: str = ""
+    mesh: Path, out: Path | None, field: str, units: str = "mm", printer: str = "", materials: str = "", up: str = ""
 ) -> "Workspace":
     """A run folder with the bodies of a labelled mesh."""
     from fab4d.io.cards import load_material, load_printer
@@ -259,8 +261,9 @@ def _labelled_workspace(
 
     workspace = Workspace(out or Path("runs") / f"{_file_name(mesh.stem)}-bodies", stage_table().artifacts)
     raw, smp = read_labelled_mesh(mesh, field)
+    card = load_printer(printer or DEFAULT_CARDS["printer"], Path())
     cards = (
-        load_printer(printer or DEFAULT_CARDS["printer"], Path()),
+        replace(card, up=_direction(up) if up else card.up),
         load_material(materials or DEFAULT_CARDS["materials"], Path()),
     )
     artifacts = labelled_bodies(raw, smp, mm_per(units), mesh.stem, *cards)
@@ -268,6 +271,17 @@ def _labelled_workspace(
         workspace.save(artifacts)
     click.echo("\n".join(file_lines(workspace)))
     return workspace
+
+
+def _direction(text: str) -> tuple[float, float, float]:
+    """The unit vector that --up gives."""
+    from fab4d.io.tables import direction
+
+    try:
+        return direction([float(word) for word in text.split(",")])
+    except ValueError as error:
+        msg = f'--up takes three numbers with commas, not all zero, as in 0,0,1, not "{text}"'
+        raise click.UsageError(msg) from error
 
 
 @main.command("slice", cls=Command, help=f"{STAGE_HELP['slice']} Makes the bodies first if needed.")

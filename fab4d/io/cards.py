@@ -37,6 +37,8 @@ class PrinterCard:
     """Diameter of both nozzles."""
     purge_per_change: float = 140.0
     """Purged at a change of tool, mm^3. Source: the default of PrusaSlicer, 70 unloading and 70 loading."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction of the permanent shape that points up while printing, unit vector; from the scene, not the card."""
 
 
 @dataclass(frozen=True)

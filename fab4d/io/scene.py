@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from fab4d.errors import SceneError
 from fab4d.io.cards import PrinterCard, RigCard, load_material, load_printer, load_rig
 from fab4d.io.tables import (
     Key,
+    direction,
     fraction,
     list_of,
     non_negative,
@@ -102,6 +103,7 @@ class Scene:
 
 _TABLE = Key(lambda value: value)
 _CARD = {"card": Key(text)}
+_ORIENTATION = {"up": Key(direction)}
 _SECTIONS = {
     "name": Key(text),
     "units": Key(one_of(*MM_PER_UNIT), required=True),
@@ -141,7 +143,7 @@ def load_scene(path: Path) -> Scene:
         permanent=file.parent / shape["permanent"],
         temporary=file.parent / shape["temporary"],
         materials=load_material(_card_name("materials", sections, file), file.parent),
-        printer=load_printer(_card_name("printer", sections, file), file.parent),
+        printer=_printer(sections.get("printer", {}), file),
         rig=load_rig(rig_section.get("card", DEFAULT_CARDS["rig"]), file.parent),
         clamp=_clamp(rig_section.get("clamp", []), mm, file),
         goal=_goal(sections.get("goal", {}), mm, file),
@@ -157,6 +159,12 @@ def load_scene(path: Path) -> Scene:
 def _card_name(section: str, sections: Mapping[str, Any], file: Path) -> str:
     keys = read_keys(sections.get(section, {}), _CARD, f"{file} [{section}]")
     return str(keys.get("card", DEFAULT_CARDS[section]))
+
+
+def _printer(table: Any, file: Path) -> PrinterCard:
+    keys = read_keys(table, _CARD | _ORIENTATION, f"{file} [printer]")
+    card = load_printer(keys.get("card", DEFAULT_CARDS["printer"]), file.parent)
+    return replace(card, up=keys.get("up", card.up))
 
 
 def _goal(table: Any, mm: float, file: Path) -> Goal:

@@ -120,6 +120,16 @@ non_negative = in_range(0, math.inf)
 fraction = in_range(0, 1)
 
 
+def direction(value: Any) -> tuple[float, float, float]:
+    """A list of three numbers, not all zero, as a unit vector."""
+    x, y, z = list_of(number, 3)(value)
+    length = math.hypot(x, y, z)
+    if length == 0:
+        msg = "a direction, three numbers that are not all zero"
+        raise ValueError(msg)
+    return x / length, y / length, z / length
+
+
 def whole(low: int) -> Parser:
     """Parser of whole numbers from `low` up."""
     expected = f"a whole number from {low} up"

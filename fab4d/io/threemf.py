@@ -43,26 +43,29 @@ class Part:
     faces: IntArray
 
 
-def prusa_3mf(title: str, parts: Sequence[Part]) -> bytes:
+def prusa_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
     """A 3MF file for PrusaSlicer: one mesh, of which each part is a range of triangles with its own extruder.
+
+    lift : how far the part is moved up to stand on the bed, mm
 
     On overlap the last part wins. Equal parts give equal bytes.
     """
     mesh = ['  <object id="1" type="model">', *_mesh(parts), "  </object>"]
-    build = [" <build>", '  <item objectid="1"/>', " </build>"]
     model = [
         _DECLARATION + f'<model unit="millimeter" xml:lang="en-US" xmlns="{_CORE}" xmlns:slic3rpe="{_PRUSA}">',
         ' <metadata name="slic3rpe:Version3mf">1</metadata>',
         *_resources(mesh),
-        *build,
+        *_build(1, lift),
         "</model>\n",
     ]
     config = "Metadata/Slic3r_PE_model.config"
     return _package({_MODEL: "\n".join(model), config: "\n".join(_prusa_config(title, parts))})
 
 
-def components_3mf(title: str, parts: Sequence[Part]) -> bytes:
+def components_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
     """A 3MF file for OrcaSlicer, Bambu Studio and Cura: one object with a component and an extruder per part.
+
+    lift : how far the part is moved up to stand on the bed, mm
 
     On overlap the last part wins. Equal parts give equal bytes.
     """
@@ -83,13 +86,16 @@ def components_3mf(title: str, parts: Sequence[Part]) -> bytes:
     model = [
         _DECLARATION + f'<model unit="millimeter" xml:lang="en-US" xmlns="{_CORE}" xmlns:cura="{_CURA}">',
         *_resources(lines),
-        " <build>",
-        f'  <item objectid="{whole}"/>',
-        " </build>",
+        *_build(whole, lift),
         "</model>\n",
     ]
     config = "\n".join(_orca_config(title, parts, whole))
     return _package({_MODEL: "\n".join(model), "Metadata/model_settings.config": config})
+
+
+def _build(number: int, lift: float) -> list[str]:
+    """The part on the bed: what lies below it a slicer may leave out."""
+    return [" <build>", f'  <item objectid="{number}" transform="1 0 0 0 1 0 0 0 1 0 0 {lift + 0.0!r}"/>', " </build>"]
 
 
 def _resources(lines: list[str]) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from fab4d.errors import MeshError
 from fab4d.fabrication.labels import LabelResult, printable_labels
+from fab4d.fabrication.orientation import standing
 from fab4d.io.cards import PrinterCard
 from fab4d.io.meshes import RawMesh
 from fab4d.materials.cards import MaterialCard
@@ -28,7 +29,7 @@ def labelled_bodies(
     Raises MeshError for an unusable mesh, BodyError for bodies that are no solids.
     """
     pair, findings = _cleaned(raw, mm)
-    result = printable_labels(pair.X, pair.tets, smp[pair.tet_map], lines_of(printer))
+    result = printable_labels(standing(pair.X, printer.up), pair.tets, smp[pair.tet_map], lines_of(printer))
     files = print_files(pair.X, pair.tets, result.smp, name, printer, materials)
     files["bodies_report"] |= {
         "labels": _label_figures(result),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from fab4d.fabrication.bodies import (
     shells,
 )
 from fab4d.fabrication.labels import clusters_of
+from fab4d.fabrication.orientation import printer_axes, standing
 from fab4d.fabrication.printability import PrintCheck, PrintLimits, print_checks, tool_changes
 from fab4d.io.cards import PrinterCard
 from fab4d.io.slicers import filament_length
@@ -46,24 +47,38 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
 def print_files(
     X: FloatArray, tets: IntArray, smp: BoolArray, name: str, printer: PrinterCard, materials: MaterialCard
 ) -> dict[str, Any]:
-    """What the stage writes for the tets (m, 4) of X (n, 3), mm, with labels smp (m,). Raises BodyError."""
+    """What the stage writes for the tets (m, 4) of X (n, 3), mm, with labels smp (m,). Raises BodyError.
+
+    The files hold the part as it stands on the printer, turned about the origin; places in the report are of X.
+    """
+    axes = printer_axes(printer.up)
+    X = standing(X, printer.up)
     bodies = bodies_from_labels(X, tets, smp)
     require_bodies(bodies)
     files = {body.name: _proven_stl(body) for body in bodies.printed}
     # In a 3MF file the last part wins where two overlap.
     parts = [_part(body) for body in reversed(bodies.printed)]
-    checks = [*print_checks(X, tets, smp, bodies, _print_limits(printer)), *_bath_check(materials)]
+    found = print_checks(X, tets, smp, bodies, _print_limits(printer))
+    checks = [*(_in_part_frame(check, axes) for check in found), *_bath_check(materials)]
+    bottom = float(bodies.whole.vertices[:, 2].min())
     changes = tool_changes(X, tets, smp, printer.layer_height)
     return {
         "smp_stl": files.get("smp"),
         "tpe_stl": files.get("tpe"),
-        "part_3mf": prusa_3mf(name, parts),
-        "part_orca_3mf": components_3mf(name, parts),
+        "part_3mf": prusa_3mf(name, parts, -bottom),
+        "part_orca_3mf": components_3mf(name, parts, -bottom),
         "bodies_report": _report(bodies, _cluster_count(tets, smp), printer, materials)
         | {"checks": [_plain(check) for check in checks]}
         | {"purge": {"tool_changes": changes, "volume_mm3": changes * printer.purge_per_change}}
-        | {"printer": asdict(printer)},
+        | {"printer": asdict(printer), "printer_axes": axes.tolist()},
     }
+
+
+def _in_part_frame(check: PrintCheck, axes: FloatArray) -> PrintCheck:
+    if check.where is None:
+        return check
+    x, y, z = (np.array(check.where) @ axes + 0.0).tolist()
+    return replace(check, where=(x, y, z))
 
 
 def _print_limits(printer: PrinterCard) -> PrintLimits:

@@ -54,7 +54,7 @@ def slice_report(slicer: Slicer, inputs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _printer(table: Mapping[str, Any]) -> PrinterCard:
-    return PrinterCard(**dict(table) | {"volume": tuple(table["volume"])})
+    return PrinterCard(**dict(table) | {name: tuple(table[name]) for name in ("volume", "up")})
 
 
 def _figures(name: str, volume: float, found: Slice, printer: PrinterCard) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from fab4d.fabrication.labels import (
     printable_labels,
     rounded_labels,
 )
+from fab4d.fabrication.orientation import standing
 from fab4d.io.scene import Acceptance, PrinterCard
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
@@ -38,7 +39,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
 def labels_for(X: FloatArray, tets: IntArray, rho: FloatArray, printer: PrinterCard) -> LabelResult:
     """`printable_labels` of the density rho (m,) for a printer; tets that the design is sure about change last."""
     sure = np.abs(rho - 0.5) + _LEAST_COST
-    return printable_labels(X, tets, rho, lines_of(printer), flip_cost=sure * np.abs(tet_volumes(X, tets)))
+    return printable_labels(
+        standing(X, printer.up), tets, rho, lines_of(printer), flip_cost=sure * np.abs(tet_volumes(X, tets))
+    )
 
 
 def lines_of(printer: PrinterCard) -> Lines:

@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ CARD = load_material("paper-corrected", Path())
 PRINTER = load_printer("generic-dual-0.4", Path())
 
 
-def run(mesh, smp):
-    profile = {"name": "box", "printer": PRINTER, "materials": CARD}
+def run(mesh, smp, up=(0.0, 0.0, 1.0)):
+    profile = {"name": "box", "printer": replace(PRINTER, up=up), "materials": CARD}
     labels = {"smp": smp, "cluster": smp.astype(int)}
     return bodies.run({"mesh": mesh, "labels": labels}, profile, SilentMonitor())
 
@@ -72,3 +73,47 @@ def test_what_the_stl_file_lost_is_noticed(mesh, monkeypatch):
     monkeypatch.setattr(bodies, "stl_bytes", lambda v, f, name: written(v, f[1:], name))
     with pytest.raises(BodyError, match="body smp"):
         run(mesh, left(mesh))
+
+
+@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.48, 0.6, 0.64)])
+def test_files_hold_the_part_as_it_stands(mesh, up):
+    out = run(mesh, left(mesh), up)
+    report = out["bodies_report"]
+    along = mesh["X"] @ np.array(up)
+    corners = [stl_arrays(out[f"{name}_stl"], name)[0] for name in ("smp", "tpe")]
+    z = np.concatenate(corners)[:, 2]
+    assert (z.min(), z.max()) == pytest.approx((along.min(), along.max()), abs=1e-4)
+    exact = 0 if max(np.abs(up)) == 1 else 1e-4
+    assert report["bodies"]["smp"]["volume_mm3"] == pytest.approx(5000, rel=exact)
+    assert report["volume_error"] < 1e-12
+    # Back in the part's frame the SMP is where it was.
+    x = (corners[0] @ np.array(report["printer_axes"]))[:, 0]
+    assert (x.min(), x.max()) == pytest.approx((0, 10), abs=1e-4)
+    for name in ("part_3mf", "part_orca_3mf"):
+        model = zipfile.ZipFile(io.BytesIO(out[name])).read("3D/3dmodel.model").decode()
+        lift = float(model.split('transform="1 0 0 0 1 0 0 0 1 0 0 ')[1].split('"')[0])
+        assert z.min() + lift == 0
+
+
+def test_places_are_told_in_the_frame_of_the_part(mesh):
+    smp = np.zeros(len(mesh["tets"]), bool)
+    smp[:6] = True
+    cell = mesh["X"][mesh["tets"][:6]].mean(axis=(0, 1))
+    for up in ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)):
+        checks = run(mesh, smp, up)["bodies_report"]["checks"]
+        found = next(check for check in checks if check["check"] == "smallest cluster")
+        assert found["where"] == pytest.approx(cell.tolist())
+
+
+def test_the_height_is_measured_along_the_printer(mesh):
+    """30 x 25 x 20 mm of 1 mm walls would fall over when they stand on a narrow side."""
+    thin = {"X": mesh["X"] * np.array([1.0, 0.02, 1.0]), "tets": mesh["tets"]}
+    name = "height over the root of the first layer's area"
+
+    def value(up):
+        checks = run(thin, left(thin), up)["bodies_report"]["checks"]
+        return next(check["value"] for check in checks if check["check"] == name)
+
+    assert value((0.0, 0.0, 1.0)) == pytest.approx(20 / np.sqrt(30 * 0.5), rel=1e-3)
+    assert value((1.0, 0.0, 0.0)) == pytest.approx(30 / np.sqrt(20 * 0.5), rel=1e-3)
+    assert value((0.0, 1.0, 0.0)) == pytest.approx(0.5 / np.sqrt(30 * 20), rel=1e-3)
