@@ -33,6 +33,7 @@ STAGE_HELP = {
     "refit": "Fit the held positions to the rounded material.",
     "verify": "Simulate the rounded design anew, from the permanent shape.",
     "sensitivity": "Tell whether the state is stable and what must be done carefully.",
+    "judge": "Give the verdict that print files and rig sheet carry.",
     "bodies": "Write the watertight bodies to print.",
     "slice": "Slice the bodies and compare.",
     "rig": "Write the sheet to stand at the rig with.",
@@ -216,7 +217,7 @@ def _checked(job: "Job") -> "Workspace":
     return job.workspace
 
 
-for _stage in stage_table().between("solve", "sensitivity"):
+for _stage in stage_table().between("solve", "judge"):
     _stage_command(_stage.name)
 
 

@@ -7,7 +7,7 @@ import io
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 
@@ -43,10 +43,10 @@ class Part:
     faces: IntArray
 
 
-def prusa_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
+def prusa_3mf(title: str, parts: Sequence[Part], lift: float = 0.0, description: str = "") -> bytes:
     """A 3MF file for PrusaSlicer: one mesh, of which each part is a range of triangles with its own extruder.
 
-    lift : how far the part is moved up to stand on the bed, mm
+    lift : how far the part is moved up to stand on the bed, mm        description : what the file says about itself
 
     On overlap the last part wins. Equal parts give equal bytes.
     """
@@ -54,6 +54,7 @@ def prusa_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
     model = [
         _DECLARATION + f'<model unit="millimeter" xml:lang="en-US" xmlns="{_CORE}" xmlns:slic3rpe="{_PRUSA}">',
         ' <metadata name="slic3rpe:Version3mf">1</metadata>',
+        *_about(title, description),
         *_resources(mesh),
         *_build(1, lift),
         "</model>\n",
@@ -62,10 +63,10 @@ def prusa_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
     return _package({_MODEL: "\n".join(model), config: "\n".join(_prusa_config(title, parts))})
 
 
-def components_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> bytes:
+def components_3mf(title: str, parts: Sequence[Part], lift: float = 0.0, description: str = "") -> bytes:
     """A 3MF file for OrcaSlicer, Bambu Studio and Cura: one object with a component and an extruder per part.
 
-    lift : how far the part is moved up to stand on the bed, mm
+    lift : how far the part is moved up to stand on the bed, mm        description : what the file says about itself
 
     On overlap the last part wins. Equal parts give equal bytes.
     """
@@ -85,12 +86,18 @@ def components_3mf(title: str, parts: Sequence[Part], lift: float = 0.0) -> byte
     lines += ["   </components>", "  </object>"]
     model = [
         _DECLARATION + f'<model unit="millimeter" xml:lang="en-US" xmlns="{_CORE}" xmlns:cura="{_CURA}">',
+        *_about(title, description),
         *_resources(lines),
         *_build(whole, lift),
         "</model>\n",
     ]
     config = "\n".join(_orca_config(title, parts, whole))
     return _package({_MODEL: "\n".join(model), "Metadata/model_settings.config": config})
+
+
+def _about(title: str, description: str) -> list[str]:
+    told = {"Title": title, "Description": description}
+    return [f' <metadata name="{key}">{escape(value)}</metadata>' for key, value in told.items() if value]
 
 
 def _build(number: int, lift: float) -> list[str]:

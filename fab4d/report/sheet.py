@@ -1,7 +1,7 @@
 """The rig sheet as a PDF: page 1 is enough at the bench, page 2 has the large views and what to know."""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,9 @@ WIDTH, HEIGHT = A4[0] / mm, A4[1] / mm
 FULL = WIDTH - 2 * MARGIN
 TITLE_WIDTH = 56.0
 """Of a view, mm of paper."""
+MOST_REASONS = 3
+"""Of a rejection, told on the first page."""
+UPRIGHT = (0.0, 0.0, 1.0)
 FOOT = 12.0
 """Height kept free at the foot of a page for the boxes to sign, mm."""
 LINE = 5.0
@@ -79,17 +82,27 @@ class Page:
 
 
 def rig_sheet(
-    name: str, plan: RigPlan, figure: Figure, reasons: list[str], sensitivity: Mapping[str, Any] | None = None
+    name: str,
+    plan: RigPlan,
+    figure: Figure,
+    reasons: list[str],
+    sensitivity: Mapping[str, Any] | None = None,
+    rejected: Sequence[str] = (),
+    up: tuple[float, float, float] = UPRIGHT,
 ) -> bytes:
     """The sheet of part `name`. Equal plans give equal bytes.
 
     figure : the part to draw       reasons : why the rig cannot do it, empty when it can
-    sensitivity : sensitivity_report
+    sensitivity : sensitivity_report       rejected : why the design is, empty when it is accepted
+    up : direction of the part's frame that pointed up on the printer
     """
+    if rejected:
+        name = f"{name} (REJECTED)"
     buffer = io.BytesIO()
     canvas = Canvas(buffer, pagesize=A4, invariant=1, pageCompression=1)
     canvas.setTitle(printable(f"Rig sheet: {name}"))
-    has_checks = _bench_page(canvas, name, plan, figure, reasons, sensitivity)
+    alerts = [*_rejection(rejected), *(f"NOT POSSIBLE ON THIS RIG: {reason}" for reason in reasons)]
+    has_checks = _bench_page(canvas, name, plan, figure, alerts + warnings(sensitivity), sensitivity, up)
     _drawing_page(canvas, name, plan, figure, not has_checks)
     canvas.save()
     return buffer.getvalue()
@@ -100,13 +113,13 @@ def _bench_page(
     name: str,
     plan: RigPlan,
     figure: Figure,
-    reasons: list[str],
+    alerts: list[str],
     sensitivity: Mapping[str, Any] | None,
+    up: tuple[float, float, float],
 ) -> bool:
     """Returns whether it has room for the caliper checks."""
     page = Page(canvas, HEIGHT - MARGIN - 4)
-    _title(page, f"Rig sheet: {name}", "mm, N; frame of the printed part (that of the STL and 3MF files)")
-    alerts = [f"NOT POSSIBLE ON THIS RIG: {reason}" for reason in reasons] + warnings(sensitivity)
+    _title(page, f"Rig sheet: {name}", _frame_words(up))
     for words in alerts:
         page.alert(words)
     page.y -= 2
@@ -120,6 +133,20 @@ def _bench_page(
     _sign_boxes(page)
     canvas.showPage()
     return has_checks
+
+
+def _rejection(reasons: Sequence[str]) -> list[str]:
+    if not reasons:
+        return []
+    more = len(reasons) - MOST_REASONS
+    told = [f"REJECTED: {reason}" for reason in reasons[:MOST_REASONS]]
+    return [*told, f"and {more} more reasons: see report.html"] if more > 0 else told
+
+
+def _frame_words(up: tuple[float, float, float]) -> str:
+    if up == UPRIGHT:
+        return "mm, N; frame of the printed part (that of the STL and 3MF files)"
+    return f"mm, N; frame of the permanent shape: ({triple(np.array(up), 3)}) pointed up on the printer"
 
 
 def _bench_words(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | None) -> None:

@@ -27,6 +27,7 @@ STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
     "refit": (1.96, 0.71),
     "verify": (0.86, 0.89),
     "sensitivity": (0.6, 0.9),
+    "judge": (0.05, 0.0),
     "bodies": (0.13, 0.46),
     "slice": (1.15, 0.61),
     "rig": (0.535, 0.04),

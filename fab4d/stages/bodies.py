@@ -1,7 +1,7 @@
 """From labels to the files that a slicer reads, each proven to be a solid before it is written."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -39,17 +39,23 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     """
     mesh, labels = inputs["mesh"], inputs["labels"]
     monitor.progress("surfaces", tets=len(mesh["tets"]))
-    return print_files(
-        mesh["X"], mesh["tets"], labels["smp"].astype(bool), profile["name"], profile["printer"], profile["materials"]
-    )
+    smp, cards = labels["smp"].astype(bool), (profile["printer"], profile["materials"])
+    return print_files(mesh["X"], mesh["tets"], smp, profile["name"], *cards, inputs["verdict_report"]["reasons"])
 
 
 def print_files(
-    X: FloatArray, tets: IntArray, smp: BoolArray, name: str, printer: PrinterCard, materials: MaterialCard
+    X: FloatArray,
+    tets: IntArray,
+    smp: BoolArray,
+    name: str,
+    printer: PrinterCard,
+    materials: MaterialCard,
+    rejected: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What the stage writes for the tets (m, 4) of X (n, 3), mm, with labels smp (m,). Raises BodyError.
 
     The files hold the part as it stands on the printer, turned about the origin; places in the report are of X.
+    rejected : why the design is rejected, which the 3MF files say in their title and description
     """
     axes = printer_axes(printer.up)
     X = standing(X, printer.up)
@@ -60,13 +66,15 @@ def print_files(
     parts = [_part(body) for body in reversed(bodies.printed)]
     found = print_checks(X, tets, smp, bodies, _print_limits(printer))
     checks = [*(_in_part_frame(check, axes) for check in found), *_bath_check(materials)]
+    title = f"{name} (REJECTED)" if rejected else name
+    says = "; ".join(["REJECTED", *rejected]) if rejected else ""
     bottom = float(bodies.whole.vertices[:, 2].min())
     changes = tool_changes(X, tets, smp, printer.layer_height)
     return {
         "smp_stl": files.get("smp"),
         "tpe_stl": files.get("tpe"),
-        "part_3mf": prusa_3mf(name, parts, -bottom),
-        "part_orca_3mf": components_3mf(name, parts, -bottom),
+        "part_3mf": prusa_3mf(title, parts, -bottom, says),
+        "part_orca_3mf": components_3mf(title, parts, -bottom, says),
         "bodies_report": _report(bodies, _cluster_count(tets, smp), printer, materials)
         | {"checks": [_plain(check) for check in checks]}
         | {"purge": {"tool_changes": changes, "volume_mm3": changes * printer.purge_per_change}}

@@ -12,14 +12,13 @@ from fab4d.report.page import report_page, view_data
 from fab4d.report.trace import joined_trace, trace_csv, trace_plot
 from fab4d.report.verdict import (
     ACCEPTED,
-    DEFAULT_TOLERANCE,
     REJECTED,
-    Limits,
     checks_of,
     left_out_of,
     print_checks_of,
     reasons_of,
 )
+from fab4d.stages._figures import figures_of, limits_of, printed_labels
 from fab4d.stages.monitor import Monitor
 
 REPORTS = (
@@ -38,10 +37,10 @@ REPORTS = (
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Everything that a person or a program reads about a finished design."""
     monitor.progress("figures")
-    mesh, state, smp = inputs["mesh"], inputs["state"], _printed_labels(inputs)
+    mesh, state, smp = inputs["mesh"], inputs["state"], printed_labels(inputs)
     shapes, reports = metrics.shapes_of(mesh, state), {name: inputs[name] for name in REPORTS}
-    limits = _limits(profile, bounding_box_diagonal(mesh["X"]))
-    figures = _figures(inputs, profile, shapes, smp)
+    limits = limits_of(profile["goal"], profile["acceptance"], profile["rig"], bounding_box_diagonal(mesh["X"]))
+    figures = figures_of(inputs, profile["materials"], shapes, smp)
     checks = checks_of(figures, limits)
     reasons = reasons_of(checks, reports)
     verdict = REJECTED if reasons else ACCEPTED
@@ -60,46 +59,6 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "report_html": report_page(
             profile["name"], report, [*checks, *print_checks_of(report["printing"])], view, plot
         ),
-    }
-
-
-def _printed_labels(inputs: Mapping[str, Any]) -> np.ndarray:
-    """(m,) bool: what is printed in SMP; nothing where nothing is to be programmed."""
-    labels = inputs["labels"]
-    return np.zeros(len(inputs["mesh"]["tets"]), bool) if labels is None else labels["smp"].astype(bool)
-
-
-def _limits(profile: Mapping[str, Any], L0: float) -> Limits:
-    goal, acceptance = profile["goal"], profile["acceptance"]
-    return Limits(
-        tolerance=DEFAULT_TOLERANCE * L0 if goal.tolerance is None else goal.tolerance,
-        max_forces=profile["rig"].max_points if goal.max_forces is None else goal.max_forces,
-        max_smp_fraction=goal.max_smp_fraction,
-        max_ambiguous_fraction=acceptance.max_ambiguous_fraction,
-        max_isolated_fraction=acceptance.max_isolated_fraction,
-    )
-
-
-def _figures(
-    inputs: Mapping[str, Any], profile: Mapping[str, Any], shapes: metrics.Shapes, smp: np.ndarray
-) -> dict[str, Any]:
-    mesh, threshold, verify = inputs["mesh"], inputs["threshold_report"] or {}, inputs["verify_report"] or {}
-    mass, cost = metrics.mass_and_cost(mesh, smp, profile["materials"])
-    return {
-        "error": metrics.error_figures(metrics.final_error(shapes), bounding_box_diagonal(shapes.X)),
-        "target_displacement_mm": metrics.target_displacement(shapes).rms,
-        "target_projection": inputs["check_report"].get("target_projection"),
-        "smp_fraction": metrics.smp_fraction(mesh, smp),
-        "forces": metrics.force_count(inputs["state"]),
-        "ambiguous_fraction": threshold.get("ambiguous_fraction"),
-        "isolated_fraction": threshold.get("isolated_fraction"),
-        "fixity": metrics.fixity(shapes),
-        "undesired_deformation": metrics.undesired_deformation(shapes),
-        "equilibrium_residual": verify.get("equilibrium_residual", {"median": None, "final": None}),
-        "min_det_F": verify.get("min_det_F"),
-        "element_order": verify.get("element_order"),
-        "mass_g": mass,
-        "cost_usd": cost,
     }
 
 

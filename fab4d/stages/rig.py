@@ -25,7 +25,13 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     monitor.progress("sheet", forces=plan.points.count)
     return {
         "rig_sheet": rig_sheet(
-            profile["name"], plan, _figure(state, inputs["labels"]), reasons, inputs["sensitivity_report"]
+            profile["name"],
+            plan,
+            _figure(state, inputs["labels"]),
+            reasons,
+            inputs["sensitivity_report"],
+            inputs["verdict_report"]["reasons"],
+            profile["printer"].up,
         ),
         "forces_csv": csv_bytes(FORCE_COLUMNS, force_rows(plan.points, inputs["mesh"]["vertex_map"])),
         "rig_report": plan_summary(plan, reasons),

@@ -139,7 +139,7 @@ def test_files_are_valid_by_the_strict_reader_of_the_3mf_consortium(writer, tmp_
     """lib3mf in strict mode, which has no wheel for every platform."""
     lib3mf = pytest.importorskip("lib3mf")
     path = tmp_path / "part.3mf"
-    path.write_bytes(writer('a "b" <c>', [part("TPE", 2), part("SMP", 1, 2.0)]))
+    path.write_bytes(writer('a "b" <c>', [part("TPE", 2), part("SMP", 1, 2.0)], 2.5, "REJECTED; <why>"))
     model = lib3mf.get_wrapper().CreateModel()
     reader = model.QueryReader("3mf")
     reader.SetStrictModeActive(True)

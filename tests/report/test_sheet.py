@@ -3,12 +3,15 @@
 import re
 import zlib
 from base64 import a85decode
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fab4d.io.cards import load_printer
 from fab4d.mesh.topology import face_table
 from fab4d.report import drawing, sheet
 from fab4d.report.labels import place_labels
@@ -21,10 +24,12 @@ from fab4d.stages.rig import run
 
 @pytest.fixture
 def rig_run(bar, profile):
-    def go(state, name="bent-bar", sensitivity=None):
+    def go(state, name="bent-bar", sensitivity=None, rejected=(), up=(0.0, 0.0, 1.0)):
         inputs = {"mesh": bar.mesh_artifact(), "labels": bar.labels_artifact(), "state": state}
         inputs["sensitivity_report"] = sensitivity or {"left_out": [], "reasons": []}
-        return run(inputs, profile | {"name": name}, SilentMonitor())
+        inputs["verdict_report"] = {"reasons": list(rejected)}
+        printer = replace(load_printer("generic-dual-0.4", Path()), up=up)
+        return run(inputs, profile | {"name": name, "printer": printer}, SilentMonitor())
 
     return go
 
@@ -209,3 +214,20 @@ def test_circles_keep_off_a_dimension_and_its_number(end: tuple[float, float]) -
         np.testing.assert_allclose(side[:, across], level)
         assert np.ptp(side[:, 1 - across]) == pytest.approx(dimension.width)
         assert side[:, 1 - across].mean() == pytest.approx(20.0)
+
+
+def test_sheet_of_a_rejected_design_says_so(bar, rig_run):
+    assert "REJECTED" not in pdf_text(rig_run(bar.state_artifact())["rig_sheet"])
+    text = pdf_text(rig_run(bar.state_artifact(), rejected=["RMS error is 9 mm", "b", "c", "d", "e"])["rig_sheet"])
+    assert "Rig sheet: bent-bar \\(REJECTED\\)" in text
+    assert "bent-bar \\(REJECTED\\): views and notes" in text
+    assert "REJECTED: RMS error is 9 mm" in text
+    assert "and 2 more reasons: see report.html" in text
+    assert "REJECTED: d" not in text
+
+
+def test_sheet_says_how_the_part_stood_on_the_printer(bar, rig_run):
+    assert "frame of the printed part" in pdf_text(rig_run(bar.state_artifact())["rig_sheet"])
+    text = pdf_text(rig_run(bar.state_artifact(), up=(1.0, 0.0, 0.0))["rig_sheet"])
+    assert "(1.000  0.000  0.000)" in text.replace("\\", "")
+    assert "pointed up on the printer" in text

@@ -18,10 +18,12 @@ CARD = load_material("paper-corrected", Path())
 PRINTER = load_printer("generic-dual-0.4", Path())
 
 
-def run(mesh, smp, up=(0.0, 0.0, 1.0)):
+def run(mesh, smp, up=(0.0, 0.0, 1.0), rejected=()):
     profile = {"name": "box", "printer": replace(PRINTER, up=up), "materials": CARD}
     labels = {"smp": smp, "cluster": smp.astype(int)}
-    return bodies.run({"mesh": mesh, "labels": labels}, profile, SilentMonitor())
+    return bodies.run(
+        {"mesh": mesh, "labels": labels, "verdict_report": {"reasons": list(rejected)}}, profile, SilentMonitor()
+    )
 
 
 def left(mesh):
@@ -117,3 +119,13 @@ def test_the_height_is_measured_along_the_printer(mesh):
     assert value((0.0, 0.0, 1.0)) == pytest.approx(20 / np.sqrt(30 * 0.5), rel=1e-3)
     assert value((1.0, 0.0, 0.0)) == pytest.approx(30 / np.sqrt(20 * 0.5), rel=1e-3)
     assert value((0.0, 1.0, 0.0)) == pytest.approx(0.5 / np.sqrt(30 * 20), rel=1e-3)
+
+
+def test_files_of_a_rejected_design_say_so(mesh):
+    good, bad = (run(mesh, left(mesh), rejected=why) for why in ((), ["RMS error is <9> mm", "too many forces"]))
+    assert bad["smp_stl"] == good["smp_stl"]
+    for name in ("part_3mf", "part_orca_3mf"):
+        model = zipfile.ZipFile(io.BytesIO(bad[name])).read("3D/3dmodel.model").decode()
+        assert '<metadata name="Title">box (REJECTED)</metadata>' in model
+        assert "REJECTED; RMS error is &lt;9&gt; mm; too many forces" in model
+        assert "REJECTED" not in zipfile.ZipFile(io.BytesIO(good[name])).read("3D/3dmodel.model").decode()

@@ -22,7 +22,9 @@ FAKE = Slicer("prusa", Path("fake"))
 @pytest.fixture(scope="module")
 def files(mesh):
     smp = mesh["X"][mesh["tets"]].mean(axis=1)[:, 0] < 10
-    return bodies.run({"mesh": mesh, "labels": {"smp": smp}}, PROFILE, SilentMonitor())
+    return bodies.run(
+        {"mesh": mesh, "labels": {"smp": smp}, "verdict_report": {"reasons": []}}, PROFILE, SilentMonitor()
+    )
 
 
 def run(files):
@@ -83,7 +85,9 @@ def test_other_volumes_are_told(files, monkeypatch, volumes, ok):
 
 def test_a_tool_without_a_body_must_not_print(mesh, monkeypatch):
     smp = np.ones(len(mesh["tets"]), bool)
-    files = bodies.run({"mesh": mesh, "labels": {"smp": smp}}, PROFILE, SilentMonitor())
+    files = bodies.run(
+        {"mesh": mesh, "labels": {"smp": smp}, "verdict_report": {"reasons": []}}, PROFILE, SilentMonitor()
+    )
     lay_down(monkeypatch, 15000, 1)
     assert [check["ok"] for check in run(files)["checks"]] == [True, False]
 

@@ -1,0 +1,53 @@
+"""The figures of a verified design and the limits of its scene, for the verdict and for the report."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fab4d.io.scene import Acceptance, Goal, RigCard
+from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.measures import bounding_box_diagonal
+from fab4d.report import metrics
+from fab4d.report.verdict import DEFAULT_TOLERANCE, Limits
+
+
+def printed_labels(inputs: Mapping[str, Any]) -> np.ndarray:
+    """(m,) bool: what is printed in SMP; nothing where nothing is to be programmed."""
+    labels = inputs["labels"]
+    return np.zeros(len(inputs["mesh"]["tets"]), bool) if labels is None else labels["smp"].astype(bool)
+
+
+def limits_of(goal: Goal, acceptance: Acceptance, rig: RigCard, L0: float) -> Limits:
+    """What the scene asks for; L0: diagonal of the part, mm."""
+    return Limits(
+        tolerance=DEFAULT_TOLERANCE * L0 if goal.tolerance is None else goal.tolerance,
+        max_forces=rig.max_points if goal.max_forces is None else goal.max_forces,
+        max_smp_fraction=goal.max_smp_fraction,
+        max_ambiguous_fraction=acceptance.max_ambiguous_fraction,
+        max_isolated_fraction=acceptance.max_isolated_fraction,
+    )
+
+
+def figures_of(
+    inputs: Mapping[str, Any], materials: MaterialCard, shapes: metrics.Shapes, smp: np.ndarray
+) -> dict[str, Any]:
+    """The figures of report.json that a verdict hangs on, and those beside them."""
+    mesh, threshold, verify = inputs["mesh"], inputs["threshold_report"] or {}, inputs["verify_report"] or {}
+    mass, cost = metrics.mass_and_cost(mesh, smp, materials)
+    return {
+        "error": metrics.error_figures(metrics.final_error(shapes), bounding_box_diagonal(shapes.X)),
+        "target_displacement_mm": metrics.target_displacement(shapes).rms,
+        "target_projection": inputs["check_report"].get("target_projection"),
+        "smp_fraction": metrics.smp_fraction(mesh, smp),
+        "forces": metrics.force_count(inputs["state"]),
+        "ambiguous_fraction": threshold.get("ambiguous_fraction"),
+        "isolated_fraction": threshold.get("isolated_fraction"),
+        "fixity": metrics.fixity(shapes),
+        "undesired_deformation": metrics.undesired_deformation(shapes),
+        "equilibrium_residual": verify.get("equilibrium_residual", {"median": None, "final": None}),
+        "min_det_F": verify.get("min_det_F"),
+        "element_order": verify.get("element_order"),
+        "mass_g": mass,
+        "cost_usd": cost,
+    }
