@@ -12,7 +12,7 @@ from fab4d.mesh.topology import face_table, vertices_near
 
 # Weight of the surface and rings of vertices around inverted tets (None: all vertices), to try in turn: first the
 # surface is fixed, then held ever more softly, and what moves stays as local as it can.
-_INSIDE = ((np.inf, 3), (np.inf, 8), (np.inf, None))
+_INSIDE = ((np.inf, 3), (np.inf, 8))
 _SURFACE = ((1e6, 3), (1e4, 3), (1e4, 8), (1e2, 8), (1e4, None), (1e2, None))
 _MAX_ROUNDS = 12
 

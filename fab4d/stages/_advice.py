@@ -101,6 +101,6 @@ def clamp_findings(pair: Pair, suggested: dict[str, Any] | None) -> list[Finding
     message = (
         "the scene has no clamp, so the forces must balance each other; "
         f"{suggested['surface_share']:.0%} of the surface moves as one to within {suggested['residual_mm']:.2g} mm and "
-        f"could be held, with fewer points elsewhere. In the scene:\n[[rig.clamp]]\nbox = {suggested['box']}"
+        f"could be held instead of pulled. In the scene:\n[[rig.clamp]]\nbox = {suggested['box']}"
     )
     return [finding("suggested-clamp", "hint", pair.files[0], message)]

@@ -61,28 +61,29 @@ def reachable_target(pair: Pair, clamp: BoolArray, materials: MaterialCard, tole
 
 
 def _projected(
-    pair: Pair, x: FloatArray, clamp: BoolArray, materials: MaterialCard, bounds: Bounds
+    pair: Pair, held: FloatArray, clamp: BoolArray, materials: MaterialCard, bounds: Bounds
 ) -> tuple[FloatArray, Finding | None]:
-    """x (n, 3) with its inside relaxed and, if it must be, its surface moved to within the bounds, or why not."""
+    """`held` (n, 3) with its inside relaxed and, if it must be, its surface moved to within the bounds, or why not."""
     kappa = materials.tpe.kappa / materials.tpe.mu
     surface = np.zeros(len(pair.X), bool)
     surface[face_table(pair.tets).boundary] = True
-    x = relaxed_inside(pair.X, x, pair.tets, surface | clamp, kappa)
+    x = relaxed_inside(pair.X, held, pair.tets, surface | clamp, kappa)
     relaxed = measured(pair.X, x, pair.tets)
     beyond = relaxed.beyond(bounds)
     if not beyond.any():
         return x, None
     where, limits = pair.tet_map[beyond], _limits(pair, relaxed, bounds)
     if share_of_volume(pair.X, pair.tets, beyond) > _HOPELESS:
-        message = f"{limits}, most of the part; {_within(pair, x, clamp, bounds)}"
+        middle = f"median det F {np.median(relaxed.det):.3g}, median stretch {np.median(relaxed.stretch):.3g}"
+        message = f"{limits}, most of the part ({middle}); {_within(pair, x, clamp, bounds)}"
         return x, finding("unreachable", "error", pair.files[1], message, where)
     x = nearest_within(pair.X, x, pair.tets, clamp, kappa, bounds)
     left = measured(pair.X, x, pair.tets)
     if not left.beyond(bounds).any():
         return x, None
     message = (
-        f"{limits}, and no shape near it keeps within these limits (left: {_limits(pair, left, bounds)}): deform the "
-        "mesh less, or in smaller steps"
+        f"{limits}, and no shape near it keeps within these limits (at {_distances(pair, held, x)[1]:.3g} mm RMS still "
+        f"{_limits(pair, left, bounds)}): deform the mesh less, or in smaller steps"
     )
     return x, finding("unreachable", "error", pair.files[1], message, where)
 
@@ -192,14 +193,14 @@ def _told(pair: Pair, projection: dict[str, Any], worst: IntArray, tolerance: fl
         message = f"{why}: the inside is relaxed anew, the surface stays"
         return finding("inside", "repaired", pair.files[1], message)
     cost = (
-        f"{projection['rms_mm']:.3g} mm RMS ({projection['rms_rel']:.1e} of the diagonal), up to "
+        f"{projection['rms_mm']:.3g} mm RMS away ({projection['rms_rel']:.1e} of the diagonal), up to "
         f"{projection['max_mm']:.3g} mm at {named('vertex', worst)}"
     )
     if projection["rms_mm"] > tolerance:
         message = (
-            f"{why}: the nearest shape that the part can take is {cost} away, but the goal's tolerance is "
+            f"{why}: the nearest shape that the part can take is {cost}, but the goal's tolerance is "
             f"{tolerance:.3g} mm: correct the shape there, deform it less, or allow a larger tolerance"
         )
         return finding("unreachable", "error", pair.files[1], message, worst)
-    message = f"{why}: projected to the nearest shape that the part can take, {cost} away"
+    message = f"{why}: projected to the nearest shape that the part can take, {cost}"
     return finding("projected", "repaired", pair.files[1], message, worst)
