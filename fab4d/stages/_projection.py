@@ -24,6 +24,8 @@ _RINGS = (4, 12, None)
 # The bounds push from here on, so that what is left at the end keeps the true ones.
 _DET_MARGIN, _STRETCH_MARGIN = 1.5, 0.95
 _MOST_STEPS = 40
+# Of Newton: by then an inside that has a place within the bounds is there, as good as relaxed.
+_FIRST_STEPS = 8
 _ROUNDING = 1e-9
 # Where more than this share of the volume is beyond the bounds, rings around it are no smaller than the part.
 _WIDESPREAD = 0.1
@@ -55,18 +57,24 @@ def share_of_volume(X: FloatArray, tets: IntArray, chosen: BoolArray) -> float:
     return float(V[chosen].sum() / V.sum())
 
 
-def relaxed_inside(X: FloatArray, x: FloatArray, tets: IntArray, held: BoolArray, kappa: float) -> FloatArray:
+def relaxed_inside(
+    X: FloatArray, x: FloatArray, tets: IntArray, held: BoolArray, kappa: float, bounds: Bounds
+) -> FloatArray:
     """x (n, 3), mm, with all vertices but the `held` (n,) ones where the elastic energy is least.
 
     The given places of the moved vertices do not matter. kappa : bulk modulus over the shear modulus
-    Where no tet can be kept from being inverted, the least inverted shape found is returned.
+    A surface that leaves no room within the bounds is not worth the exact minimum: then the shape is only near it.
     """
     smooth = closest_shape(X, tets, np.zeros((len(tets), 3, 3)), np.flatnonzero(held), x)
     start = untangle(X, np.where(held[:, None], x, smooth), tets, held)
     if start.min_det_F <= 0 or held.all():
         return start.x
-    none = np.zeros(len(X))
-    return _drawn(X, start.x, start.x, tets, ~held, none, kappa, Bounds(0.0, np.inf), 0.0, 1e-10)
+    x, none, no_bounds = start.x, np.zeros(len(X)), Bounds(0.0, np.inf)
+    for most_steps in (_FIRST_STEPS, _MOST_STEPS):
+        x = _drawn(X, x, x, tets, ~held, none, kappa, no_bounds, 0.0, 1e-10, most_steps)
+        if measured(X, x, tets).beyond(bounds).any():
+            break
+    return x
 
 
 def nearest_within(
@@ -104,6 +112,7 @@ def _drawn(
     bounds: Bounds,
     strength: float,
     tolerance: float,
+    most_steps: int = _MOST_STEPS,
 ) -> FloatArray:
     """The minimum of `DrawnBody` over the vertices `free` (n,), from `start`; lengths in mm, only their tets count."""
     L0 = bounding_box_diagonal(X)
@@ -112,11 +121,11 @@ def _drawn(
     body = discretise(X[nodes] / L0, local.reshape(-1, 4).astype(np.int64))
     drawn = DrawnBody(body, kappa, np.where(free, pull, 0.0)[nodes], wanted[nodes] / L0, bounds, strength)
     x = start.copy()
-    x[nodes] = L0 * _minimum(drawn, start[nodes] / L0, free[nodes], tolerance)
+    x[nodes] = L0 * _minimum(drawn, start[nodes] / L0, free[nodes], tolerance, most_steps)
     return np.where(free[:, None], x, start)
 
 
-def _minimum(drawn: DrawnBody, start: FloatArray, free: BoolArray, tolerance: float) -> FloatArray:
+def _minimum(drawn: DrawnBody, start: FloatArray, free: BoolArray, tolerance: float, most_steps: int) -> FloatArray:
     pattern = build_pattern(drawn.body.elements, len(start))
     analysis = analyse(pattern.indptr, pattern.indices)
     fixed = np.flatnonzero(np.repeat(~free, 3))
@@ -137,6 +146,6 @@ def _minimum(drawn: DrawnBody, start: FloatArray, free: BoolArray, tolerance: fl
         return analysis.factor(data)
 
     found = newton(
-        residual, lambda z: factor(z, False), start.ravel(), tolerance, _MOST_STEPS, lambda z: factor(z, True)
+        residual, lambda z: factor(z, False), start.ravel(), tolerance, most_steps, lambda z: factor(z, True)
     )
     return found.z.reshape(-1, 3)

@@ -67,7 +67,7 @@ def _projected(
     kappa = materials.tpe.kappa / materials.tpe.mu
     surface = np.zeros(len(pair.X), bool)
     surface[face_table(pair.tets).boundary] = True
-    x = relaxed_inside(pair.X, held, pair.tets, surface | clamp, kappa)
+    x = relaxed_inside(pair.X, held, pair.tets, surface | clamp, kappa, bounds)
     relaxed = measured(pair.X, x, pair.tets)
     beyond = relaxed.beyond(bounds)
     if not beyond.any():
