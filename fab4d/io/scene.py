@@ -40,11 +40,13 @@ class ClampRegion:
 @dataclass(frozen=True)
 class Goal:
     """What the user wants. tolerance: largest RMS distance to the temporary shape, mm (None: 5e-3 of the diagonal);
-    max_forces: most points to pull (None: the rig's); max_smp_fraction: largest share of SMP in the volume."""
+    max_forces: most points to pull (None: the rig's); max_smp_fraction: largest share of SMP in the volume; smp:
+    `enough` for the first design that meets the goal, `least` to search on for the one with the least SMP."""
 
     tolerance: float | None = None
     max_forces: int | None = None
     max_smp_fraction: float | None = None
+    smp: str = "enough"
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,12 @@ _SECTIONS = {
     "shape": Key(lambda value: value, required=True),
 } | dict.fromkeys(("materials", "printer", "rig", "goal", "weights", "acceptance", "solver", "gravity"), _TABLE)
 _SHAPE = {"permanent": Key(text, required=True), "temporary": Key(text, required=True)}
-_GOAL = {"tolerance": Key(positive), "max_forces": Key(whole(1)), "max_smp_fraction": Key(fraction)}
+_GOAL = {
+    "tolerance": Key(positive),
+    "max_forces": Key(whole(1)),
+    "max_smp_fraction": Key(fraction),
+    "smp": Key(one_of("enough", "least")),
+}
 _WEIGHTS = {weight.name: Key(non_negative) for weight in fields(Weights)}
 _ACCEPTANCE = {limit.name: Key(fraction) for limit in fields(Acceptance)}
 _SOLVER = {

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fab4d.design.tradeoff import MOST_TRIALS
 from fab4d.runner.display import duration
 from fab4d.runner.job import Job
 from fab4d.runner.runner import Selection, Step, plan
@@ -47,7 +48,7 @@ def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[s
         *(f"  {step.stage:<10} {step.state:<8} {step.reason}".rstrip() for step in steps),
         *finding_lines(check_report.get("findings", [])),
         *_left_out_lines(check_report),
-        _expectation(steps, n_tets),
+        _expectation(steps, n_tets, least_smp=job.scene.goal.smp == "least"),
     ]
 
 
@@ -60,11 +61,12 @@ def _left_out_lines(check_report: Mapping[str, Any]) -> list[str]:
     return ["left out:", *(f"  {item['what']}: {item['why']}" for item in left_out)] if left_out else []
 
 
-def _expectation(steps: Sequence[Step], n_tets: int) -> str:
+def _expectation(steps: Sequence[Step], n_tets: int, *, least_smp: bool) -> str:
     ahead = [step.stage for step in steps if step.state != "current"]
     if not ahead:
         return "expected: nothing to do"
-    seconds = sum(stage_seconds(stage, n_tets) for stage in ahead)
+    searches = {"solve": MOST_TRIALS} if least_smp else {}
+    seconds = sum(searches.get(stage, 1) * stage_seconds(stage, n_tets) for stage in ahead)
     return f"expected, roughly, on two cores: {duration(seconds)}, {peak_mb(n_tets):.0f} MB of memory"
 
 

@@ -1,18 +1,26 @@
-"""A near 0/1 design as it will be printed: repaired labels, and held positions fitted to them."""
+"""A near 0/1 design as it will be printed, labels repaired and held positions fitted, and what speaks against it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from fab4d.design.flips import polish_labels
+from fab4d.design.forward import program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, change_density, refit
 from fab4d.errors import EquilibriumError
-from fab4d.io.scene import PrinterCard
+from fab4d.fabrication.labels import ambiguous_fraction, isolated_fraction, rounded_labels
+from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.tetmesh import BoolArray
-from fab4d.stages.threshold import labels_for
+from fab4d.stages.refit import flip_settings, limit_reasons
+from fab4d.stages.threshold import acceptance_reasons, labels_for
+
+# Flips win back a part of what rounding costs: beyond this multiple of the tolerance they do not reach it.
+HOPELESS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +36,69 @@ def as_printed(
     problem: Problem,
     mesh: Mapping[str, np.ndarray],
     printer: PrinterCard,
+    goal: Goal,
     weights: ObjectiveWeights,
     found: Search,
+    good_enough: float = 0.0,
 ) -> Printed:
-    """The design with printable labels and refitted held positions."""
+    """The design as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
+
+    Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
+    """
     smp = labels_for(mesh["X"], mesh["tets"], found.design.rho, printer).smp
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))
     except EquilibriumError:
         return Printed(smp, np.inf, None)
     design = refit(found.equilibria, design, weights, lambda at: None)  # noqa: ARG005
-    return Printed(smp, shape_error(problem, design.final.y).rms, design)
+    if good_enough < shape_error(problem, design.final.y).rms < HOPELESS * weights.error_scale:
+        settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
+        design = polish_labels(found.equilibria, design, weights, settings, lambda at: None)  # noqa: ARG005
+    return Printed(design.rho > 0.5, shape_error(problem, design.final.y).rms, design)
+
+
+def smp_share(problem: Problem, smp: BoolArray) -> float:
+    """Share of the labels smp (m,) in the volume."""
+    return float(problem.volume_fractions[smp].sum())
+
+
+def faults(
+    problem: Problem,
+    tets: np.ndarray,
+    profile: Mapping[str, Any],
+    found: Search,
+    printed: Printed,
+    largest_rms: float,
+) -> list[str]:
+    """Why the printed design would be rejected; empty for an acceptable one. largest_rms is in L0.
+
+    profile : sections goal, rig and acceptance
+    """
+    if printed.design is None:
+        return ["the printed labels have no equilibrium near the design"]
+    seen = [
+        *_goal_faults(problem, profile["goal"].max_smp_fraction, printed, largest_rms),
+        *acceptance_reasons(
+            ambiguous_fraction(found.design.rho),
+            isolated_fraction(tets, rounded_labels(found.design.rho)),
+            profile["acceptance"],
+        ),
+        *limit_reasons(problem, found.equilibria.patches, printed.design, profile),
+    ]
+    return seen or _loading_faults(found, printed.design)
+
+
+def _goal_faults(problem: Problem, max_smp: float | None, printed: Printed, largest_rms: float) -> list[str]:
+    rms, limit, share = printed.rms * problem.length, largest_rms * problem.length, smp_share(problem, printed.smp)
+    seen = [f"the error is {rms:.3g} mm RMS, {limit:.3g} mm are allowed"] if rms > limit else []
+    if max_smp is not None and share > max_smp:
+        seen.append(f"{share:.1%} of the volume are SMP, {max_smp:.1%} are allowed")
+    return seen
+
+
+def _loading_faults(found: Search, design: Design) -> list[str]:
+    """What the simulated loading, which takes long, says against a design that is else acceptable."""
+    done = program(found.equilibria, design.rho, design.median.x, design.median.forces)
+    if same_shape(done, design.median.x):
+        return []
+    return ["loading from the permanent shape does not end in the designed state"]

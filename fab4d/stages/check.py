@@ -74,7 +74,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         findings += [*_outlook(target, clamp, tolerance, profile), *clamp_findings(target.pair, suggested)]
     monitor.progress("self-intersection")
     findings += _refuse(_self_intersections(target.pair, nothing_to_program))
-    report = _report(target, clamp, findings, nothing_to_program) | {"suggested_clamp": suggested}
+    report = _report(target, clamp, profile["goal"], findings, nothing_to_program) | {"suggested_clamp": suggested}
     return {"mesh": _arrays(target, clamp), "check_report": report}
 
 
@@ -123,13 +123,15 @@ def _arrays(target: Target, clamp: BoolArray) -> dict[str, np.ndarray]:
     }
 
 
-def _report(target: Target, clamp: BoolArray, findings: list[Finding], nothing_to_program: bool) -> dict[str, Any]:
+def _report(
+    target: Target, clamp: BoolArray, goal: Goal, findings: list[Finding], nothing_to_program: bool
+) -> dict[str, Any]:
     return {
         "findings": [asdict(found) | {"indices": list(found.indices)} for found in findings],
         "nothing_to_program": nothing_to_program,
         "statistics": _statistics(target.pair, clamp),
         "target_projection": target.projection,
-        "left_out": _left_out(target, clamp, nothing_to_program),
+        "left_out": _left_out(target, clamp, goal, nothing_to_program),
     }
 
 
@@ -391,7 +393,7 @@ def _statistics(pair: Pair, clamp: BoolArray) -> dict[str, float | int]:
     }
 
 
-def _left_out(target: Target, clamp: BoolArray, nothing_to_program: bool) -> list[dict[str, str]]:
+def _left_out(target: Target, clamp: BoolArray, goal: Goal, nothing_to_program: bool) -> list[dict[str, str]]:
     left_out = [
         {"what": "gravity", "why": "the scene has none"},
     ]
@@ -399,6 +401,9 @@ def _left_out(target: Target, clamp: BoolArray, nothing_to_program: bool) -> lis
         left_out.append({"what": "clamp", "why": "the scene has none: the forces balance each other"})
     if target.projection is None and not nothing_to_program:
         left_out.append({"what": "projection of the temporary shape", "why": "an elastic part can take it as it is"})
+    if goal.smp == "enough" and not nothing_to_program:
+        why = 'the first design that meets the goal is taken ([goal] smp = "least" searches on)'
+        left_out.append({"what": "search for the least SMP", "why": why})
     if nothing_to_program:
         why = "the temporary shape is the permanent one, moved rigidly"
         left_out.append({"what": "design, forces and rig sheet", "why": why})

@@ -16,6 +16,7 @@ from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import smp_clusters
 from fab4d.fabrication.wellcomposed import flip_check
+from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import face_area_vectors, tet_volumes
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
@@ -55,7 +56,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     design = polished(equilibria, design)
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
-    reasons = _limit_reasons(problem, equilibria.patches, design, profile)
+    reasons = limit_reasons(problem, equilibria.patches, design, profile)
     volumes = tet_volumes(mesh["X"], mesh["tets"])
     report = {
         "fits": fits,
@@ -105,15 +106,20 @@ def _polish(
     trace: Trace,
 ) -> Callable[[Design], Design]:
     """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
-    limit = profile["goal"].max_smp_fraction
-    settings = FlipSettings(
-        printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), profile["printer"]).smp,
-        flippable=flip_check(tets),
-        target_rms=float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length,
-        max_smp_fraction=1.0 if limit is None else limit,
-    )
+    target_rms = float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
+    settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], target_rms)
     return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
+
+
+def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Goal, target_rms: float) -> FlipSettings:
+    """Flips that keep the labels printable and within the goal's share of SMP, down to the RMS error target_rms, L0."""
+    X, tets = mesh["X"], mesh["tets"]
+    return FlipSettings(
+        printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), printer).smp,
+        flippable=flip_check(tets),
+        target_rms=target_rms,
+        max_smp_fraction=1.0 if goal.max_smp_fraction is None else goal.max_smp_fraction,
+    )
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:
@@ -136,7 +142,7 @@ def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -
     return design
 
 
-def _limit_reasons(problem: Problem, patches: Patches, design: Design, profile: Mapping[str, Any]) -> list[str]:
+def limit_reasons(problem: Problem, patches: Patches, design: Design, profile: Mapping[str, Any]) -> list[str]:
     """What of the rig's limits the design does not keep."""
     rig, forces = profile["rig"], design.median.forces * problem.force
     sizes = np.linalg.norm(forces, axis=1)

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import ReducedSettings, Search, Watch, at_rest, solve_reduced
+from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, solve_reduced
 from fab4d.errors import SceneError
-from fab4d.io.scene import Goal, RigCard
+from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
+from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
@@ -25,12 +26,8 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Choose the points, relax the density, drive it to 0 and 1; again with other weights if printing costs a lot."""
-    mesh, weights = inputs["mesh"], profile["weights"]
-    if weights.lam_force is not None:
-        msg = (
-            "weights.lam_force: the reduced solver takes a number of points ([goal] max_forces), not a price of forces"
-        )
-        raise SceneError(msg)
+    mesh = inputs["mesh"]
+    _refuse_weights(profile["weights"], profile["goal"])
     problem = problem_of(mesh, profile["materials"], "linear")
     monitor.progress("compile, measure tau")
     tau_s = tau_seconds(problem)
@@ -43,14 +40,32 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         ]
         return _artifacts(problem, rest, trace, {"tau_s": tau_s, "left_out": why})
     found, attempts, rms = _search(problem, mesh, profile, trace, monitor)
+    least = None
+    if profile["goal"].smp == "least":
+        settings = search_settings(problem, profile, attempts - 1)
+        sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
+        least = least_smp(problem, mesh, sections, settings, found, trace, monitor)
+        found, rms = least.found, least.printed_rms
     report = {
         "tau_s": tau_s,
         "iterations": len(trace.rows),
         "attempts": attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
+        "least_smp": None if least is None else least.trials,
         "left_out": LEFT_OUT,
     }
     return _artifacts(problem, found, trace, report)
+
+
+def _refuse_weights(weights: Weights, goal: Goal) -> None:
+    if weights.lam_force is not None:
+        msg = (
+            "weights.lam_force: the reduced solver takes a number of points ([goal] max_forces), not a price of forces"
+        )
+        raise SceneError(msg)
+    if weights.lam_SMP == 0 and goal.smp == "least":
+        msg = 'weights.lam_SMP is 0, from where [goal] smp = "least" cannot search: leave it out or raise it'
+        raise SceneError(msg)
 
 
 def _search(
@@ -60,10 +75,11 @@ def _search(
     first, start = _resumed(problem, profile, trace, monitor)
     best, least = _restored_best(problem, profile, monitor)
     for attempt in range(first, len(ATTEMPTS)):
-        settings = _settings(problem, profile, attempt)
+        settings = search_settings(problem, profile, attempt)
         watch = _watch(attempt, start, trace, monitor)
         found = solve_reduced(problem, settings, watch, start)
-        rms, start = as_printed(problem, mesh, profile["printer"], settings.weights, found).rms, None
+        start, weights = None, settings.weights
+        rms = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, weights.error_scale).rms
         if best is None or rms < least:
             best, least = found, rms
             monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
@@ -81,11 +97,14 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor) -
         trace.add(phase, at)
         phase = at.phase.value
         monitor.save(CHECKPOINT, _checkpoint(attempt, at, trace))
+        if at.phase is Phase.ROUND and at.iteration == 0:
+            monitor.save(RELAXED, search_arrays(at))
 
     return watch
 
 
-def _settings(problem: Problem, profile: Mapping[str, Any], attempt: int) -> ReducedSettings:
+def search_settings(problem: Problem, profile: Mapping[str, Any], attempt: int = 0) -> ReducedSettings:
+    """The solver's settings for one of the ATTEMPTS. profile : sections goal, rig, weights and materials"""
     goal: Goal = profile["goal"]
     rig: RigCard = profile["rig"]
     weights = objective_weights(problem, goal, profile["weights"], rig, profile["materials"])

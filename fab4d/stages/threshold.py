@@ -56,7 +56,7 @@ def _report(
     volumes = np.abs(tet_volumes(X, tets))
     ambiguous = ambiguous_fraction(rho)
     isolated = isolated_fraction(tets, rounded_labels(rho))
-    reasons = _reasons(ambiguous, isolated, acceptance) + _lost(rho, labels.smp)
+    reasons = acceptance_reasons(ambiguous, isolated, acceptance) + _lost(rho, labels.smp)
     return {
         "ambiguous_fraction": ambiguous,
         "isolated_fraction": isolated,
@@ -72,7 +72,8 @@ def _report(
     }
 
 
-def _reasons(ambiguous: float, isolated: float, acceptance: Acceptance) -> list[str]:
+def acceptance_reasons(ambiguous: float, isolated: float, acceptance: Acceptance) -> list[str]:
+    """What the paper's two acceptance checks say against a design."""
     checks = (
         (ambiguous, acceptance.max_ambiguous_fraction, "of the tets are neither SMP nor TPE (density 0.05 to 0.95)"),
         (isolated, acceptance.max_isolated_fraction, "of the SMP tets touch no other SMP tet"),
