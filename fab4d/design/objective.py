@@ -102,7 +102,7 @@ def force_excess(forces: FloatArray, max_force: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StretchExcess:
-    """The tets (k,) that the median shape stretches too far, at their most stretched quadrature points.
+    """The tets (k,) whose mean deformation gradient in the median shape is stretched too far.
 
     values (k,) : relative excess times sqrt(2 limit), half of whose squares sum to the penalty
     rows (k, 3N), by_density (k,) : their derivatives with respect to x and to the tet's own density
@@ -127,23 +127,22 @@ def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray,
     if np.isinf(weights.smp_max_stretch) or np.isinf(weights.tpe_max_stretch):
         return StretchExcess(np.zeros(0, np.int64), np.zeros(0), csr_array((0, x.size)), np.zeros(0))
     allowed = rho * weights.smp_max_stretch + (1 - rho) * weights.tpe_max_stretch
-    F = np.einsum("mai,mqaj->mqij", x[body.elements], body.dN)
+    dN = body.dN.mean(axis=1)
+    F = np.einsum("mai,maj->mij", x[body.elements], dN)
     # The Frobenius norm bounds the largest stretch from above: most tets need no singular values.
-    near = np.flatnonzero(np.sqrt((F**2).sum(axis=(2, 3))).max(axis=1) > allowed)
+    near = np.flatnonzero(np.sqrt((F**2).sum(axis=(1, 2))) > allowed)
     U, s, Vt = np.linalg.svd(F[near])
-    point = s[:, :, 0].argmax(axis=1)
-    pick = np.arange(len(near)), point
-    over = s[*pick, 0] > allowed[near]
-    tets, pick = near[over], (pick[0][over], point[over])
+    over = s[:, 0] > allowed[near]
+    tets, largest = near[over], s[over, 0]
     scale = np.sqrt(2 * weights.limit) / allowed[tets]
-    values = scale * (s[*pick, 0] - allowed[tets])
+    values = scale * (largest - allowed[tets])
     # d sigma_1 = u_1 . dF v_1
-    along = np.einsum("kaj,kj->ka", body.dN[tets, pick[1]], Vt[*pick, 0])
-    data = scale[:, None, None] * along[:, :, None] * U[*pick, :, 0][:, None, :]
+    along = np.einsum("kaj,kj->ka", dN[tets], Vt[over, 0])
+    data = scale[:, None, None] * along[:, :, None] * U[over, :, 0][:, None, :]
     columns = (3 * body.elements[tets][:, :, None] + np.arange(3)).reshape(-1)
     indptr = np.arange(0, len(tets) * 3 * nn + 1, 3 * nn)
     rows = csr_array((data.ravel(), columns, indptr), shape=(len(tets), x.size))
-    by_density = -scale * s[*pick, 0] / allowed[tets] * (weights.smp_max_stretch - weights.tpe_max_stretch)
+    by_density = -scale * largest / allowed[tets] * (weights.smp_max_stretch - weights.tpe_max_stretch)
     return StretchExcess(tets, values, rows, by_density)
 
 

@@ -10,7 +10,7 @@ from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.problem import Problem
 from fab4d.mesh.distance import shape_error
-from fab4d.mesh.measures import deformation_gradients, vertex_areas
+from fab4d.mesh.measures import vertex_areas
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import patch_arrays, patches_of, problem_of
 from fab4d.stages.monitor import Monitor
@@ -29,7 +29,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     y = done.final.y * problem.length
     n = len(mesh["X"])
     error = shape_error(y[:n], mesh["X_temp"], problem.faces, vertex_areas(mesh["X"], problem.faces))
-    stretched = _stretch_reasons(mesh, done.median.x[:n] * problem.length, smp, materials)
+    stretched = _stretch_reasons(problem, mesh, done.median.x, smp, materials)
     reasons = _path_reasons(problem, done, x) + stretched
     report = {
         "element_order": problem.body.order,
@@ -56,9 +56,13 @@ def _path_reasons(problem: Problem, done: Programming, x: FloatArray) -> list[st
     return []
 
 
-def _stretch_reasons(mesh: Mapping[str, np.ndarray], x: FloatArray, smp: FloatArray, materials: Any) -> list[str]:
-    """Materials that the median shape stretches beyond their card's limit."""
-    stretch = np.linalg.svd(deformation_gradients(mesh["X"], x, mesh["tets"]), compute_uv=False)[:, 0]
+def _stretch_reasons(
+    problem: Problem, mesh: Mapping[str, np.ndarray], x: FloatArray, smp: FloatArray, materials: Any
+) -> list[str]:
+    """Materials that the median shape x (N, 3) stretches beyond their card's limit, as the mean of a tet."""
+    body = problem.body
+    F = np.einsum("mai,maj->mij", x[body.elements], body.dN.mean(axis=1))
+    stretch = np.linalg.svd(F, compute_uv=False)[:, 0]
     reasons = []
     for name, inside, limit in (
         ("SMP", smp > 0, materials.smp_max_stretch),
