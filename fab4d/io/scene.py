@@ -70,7 +70,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """method: `reduced`; element: `linear` or `quadratic`; seed of every random choice."""
+    """method: `reduced`; element of the last fit: `auto`, `linear` or `quadratic`; seed of every random choice."""
 
     method: str = "reduced"
     element: str = "linear"
@@ -122,7 +122,7 @@ _WEIGHTS = {weight.name: Key(non_negative) for weight in fields(Weights)}
 _ACCEPTANCE = {limit.name: Key(fraction) for limit in fields(Acceptance)}
 _SOLVER = {
     "method": Key(one_of("reduced")),
-    "element": Key(one_of("linear", "quadratic")),
+    "element": Key(one_of("auto", "linear", "quadratic")),
     "seed": Key(whole(0)),
 }
 _GRAVITY = {"direction": Key(list_of(number, 3), required=True)}

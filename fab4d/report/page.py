@@ -102,6 +102,18 @@ def _projection(projection: Mapping[str, Any] | None) -> dict[str, str]:
     return {"nearest shape that the part can take, RMS from the wanted": f"{plain(projection['rms_mm'])} mm"}
 
 
+def _force_trust(report: Mapping[str, Any]) -> dict[str, str]:
+    """The largest force in linear and quadratic elements, and what the mesh leaves uncertain."""
+    change, uncertainty = report.get("force_change"), report.get("force_uncertainty")
+    shown = {}
+    if change:
+        largest = f"{plain(max(change['linear_N']))} / {plain(max(change['quadratic_N']))} N"
+        shown["largest force in linear / quadratic elements"] = largest
+    if uncertainty:
+        shown["uncertainty of the forces"] = f"{plain(max(uncertainty['N']))} N"
+    return shown
+
+
 def _figures(report: Mapping[str, Any]) -> str:
     error, residual = report["error"], report["equilibrium_residual"]
     shown = {
@@ -113,6 +125,7 @@ def _figures(report: Mapping[str, Any]) -> str:
         **_projection(report.get("target_projection")),
         "SMP share of the volume": plain(report["smp_fraction"]),
         "forces": str(report["forces"]),
+        **_force_trust(report),
         "fixity": _or_dash(report["fixity"]),
         "undesired deformation": _or_dash(report["undesired_deformation"]),
         "smallest det F": _or_dash(report["min_det_F"]),

@@ -17,7 +17,7 @@ from fab4d.report.drawing import RED, VIEW_MARGIN, draw_view
 from fab4d.report.views import FRAMES, Figure, fitted
 from fab4d.report.wording import kelvin, number, printable, significant, triple
 from fab4d.rig.clamp import Clamp
-from fab4d.rig.plan import RigPlan
+from fab4d.rig.plan import ForceTrust, RigPlan
 from fab4d.rig.schedule import BATH_MARGIN, CONDUCTIVITY, FILM_COEFFICIENTS, ROOM_TEMPERATURE, SPECIFIC_HEAT, Step
 from fab4d.units import N_PER_KGF
 
@@ -271,12 +271,12 @@ def _point_table(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | Non
     p = plan.points
     columns = [
         ("No", 8.0, "l"),
-        ("On the printed part x y z", 33.0, "l"),
+        ("On the printed part x y z", 31.5, "l"),
         ("Pad r / area", 22.0, "l"),
         ("HOLD AT x y z", 33.0, "l"),
-        ("Direction (unit)", 30.0, "l"),
-        ("Azim / elev", 20.0, "l"),
-        ("N", 14.0, "r"),
+        ("Direction (unit)", 28.5, "l"),
+        ("Azim / elev", 17.0, "l"),
+        ("N", 20.0, "r"),
         ("kgf", 12.0, "r"),
         ("1 mm off*", 14.0, "r"),
     ]
@@ -290,7 +290,7 @@ def _point_table(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | Non
             triple(p.hold[k]),
             triple(p.direction[k], 3),
             f"{number(p.azimuth[k], 0)}° / {number(p.elevation[k], 0)}°",
-            significant(p.size[k]),
+            _force_words(p.size[k], None if plan.trust.uncertainty is None else plan.trust.uncertainty[k]),
             significant(p.kgf[k]),
             off[k],
         ]
@@ -300,9 +300,27 @@ def _point_table(page: Page, plan: RigPlan, sensitivity: Mapping[str, Any] | Non
     page.paragraph(
         "Azimuth from +x to +y, elevation above xy. * RMS error of the finished shape, mm, when this pad alone is 1 mm "
         "off in its worst direction. "
-        f"True forces: probably {number(100 * plan.trust.least_fraction, 0)} % to 100 % of these, so go by position.",
+        f"{_true_forces(plan)}, so go by position.",
         size=6.5,
     )
+
+
+def _force_words(size: float, uncertainty: float | None) -> str:
+    return (
+        significant(size)
+        if uncertainty is None
+        else f"{significant(size)} ± {number(uncertainty, _places(uncertainty))}"
+    )
+
+
+def _places(uncertainty: float) -> int:
+    return 0 if uncertainty >= 9.5 else 1
+
+
+def _true_forces(plan: RigPlan) -> str:
+    if plan.trust.uncertainty is None:
+        return f"True forces: probably {number(100 * plan.trust.least_fraction, 0)} % to 100 % of these"
+    return "±: what the mesh leaves uncertain"
 
 
 def _careful_table(page: Page, sensitivity: Mapping[str, Any] | None) -> None:
@@ -402,12 +420,26 @@ def _trust(plan: RigPlan) -> list[str]:
     films = ", ".join(f"{film:g} W/(m² K) in {bath}" for bath, film in FILM_COEFFICIENTS)
     return [
         "Positions first: go to the hold positions and let the forces be what they are. "
-        f"The forces come from {kind} tets with about {number(trust.elements_across)} across the thickest wall. "
-        "A bar in bending so meshed comes out too stiff: the true forces are probably between "
-        f"{number(100 * trust.least_fraction, 0)} % and 100 % of those printed, less in thinner places.",
+        f"The forces come from {kind} tets with about {number(trust.elements_across)} across the thinnest walls. "
+        + _uncertainty_words(trust),
         "Bath times: one-term solution of heat conduction through a plane wall of the thickest section (Incropera & "
         f"DeWitt, section 5.5.1), conductivity {CONDUCTIVITY:g} W/(m K), specific heat {SPECIFIC_HEAT:g} J/(kg K), "
         f"film {films}. The bath is {BATH_MARGIN:g} K beyond what the core must reach. Check that it is below the "
         "service limit of the TPE.",
         "Moduli are those of the material card; a batch twice as stiff needs twice the force at the same positions.",
     ]
+
+
+def _uncertainty_words(trust: ForceTrust) -> str:
+    thin = ""
+    if trust.element_order == 1 and trust.thin_share > 0:
+        thin = (
+            f" Fewer than two tets span {number(100 * trust.thin_share, 0)} % of the walls, the fewest near "
+            f"{triple(trust.thin_place)}: refine the mesh there."
+        )
+    if trust.uncertainty is None:
+        return (
+            "A bar in bending so meshed comes out too stiff: the true forces are probably between "
+            f"{number(100 * trust.least_fraction, 0)} % and 100 % of those printed.{thin}"
+        )
+    return f"Their uncertainty is that of the mesh alone, by comparison with {trust.method}.{thin}"

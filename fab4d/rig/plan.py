@@ -9,6 +9,7 @@ import numpy as np
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import face_table
+from fab4d.mesh.walls import walls
 from fab4d.rig.checks import CaliperChecks, caliper_checks
 from fab4d.rig.clamp import Clamp, clamp_of, corner_mark
 from fab4d.rig.points import LoadPoints, load_points
@@ -19,15 +20,28 @@ LINEAR_FLEXIBILITY = ((1.0, 0.15), (2.0, 0.37), (4.0, 0.67), (8.0, 0.87))
 # The same by quadratic tets.
 QUADRATIC_FLEXIBILITY = ((1.0, 0.93), (2.0, 0.97), (8.0, 1.0))
 
+# Fewer elements across a wall than this are worth a warning. It may hold for a share of small details.
+FEWEST_ELEMENTS, COARSE_SHARE = 1.9, 0.05
+# A part without opposite walls has no number of elements across them.
+MOST_COUNTED = 100.0
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class ForceTrust:
-    """How far the forces are to be trusted: element order, elements across the thickest wall, and the least true force
-    as a fraction of the computed one."""
+    """How far the forces are to be trusted.
+
+    elements_across : elements that span the thinnest walls        thin_share : share of the walls' area that fewer than
+    two span, around `thin_place` (3,), mm        least_fraction : least true force over the computed one
+    uncertainty : (K,) N, that of each force by `method`; None where it was left out
+    """
 
     element_order: int
     elements_across: float
     least_fraction: float
+    thin_share: float
+    thin_place: FloatArray
+    uncertainty: FloatArray | None
+    method: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +59,10 @@ class RigPlan:
     left_out: tuple[dict[str, str], ...]
 
 
-def rig_plan(state: Mapping[str, np.ndarray], card: MaterialCard) -> RigPlan:
-    """The plan for a verified state (pipeline/README.md)."""
+def rig_plan(
+    state: Mapping[str, np.ndarray], card: MaterialCard, uncertainty: Mapping[str, Any] | None = None
+) -> RigPlan:
+    """The plan for a verified state with the `force_uncertainty` of its report (pipeline/README.md)."""
     X, tets = state["nodes"], state["elements"][:, :4]
     faces = face_table(tets).boundary
     points, clamp = load_points(state), clamp_of(state, faces)
@@ -60,22 +76,27 @@ def rig_plan(state: Mapping[str, np.ndarray], card: MaterialCard) -> RigPlan:
         wall=wall,
         steps=schedule(card, wall, clamp is not None),
         checks=caliper_checks(X, state["x"], state["y"], faces, np.append(points.vertex, mark)),
-        trust=force_trust(X, state["elements"], wall),
+        trust=force_trust(X, state["elements"], uncertainty),
         left_out=_left_out(clamp),
     )
 
 
-def force_trust(X: FloatArray, elements: IntArray, wall: float) -> ForceTrust:
-    """Trust in forces from elements (m, 4 or 10) in a part whose thickest wall is `wall` mm: model.md section 5.
-
-    Bending is judged by elements across the thickest wall, so thinner places are worse.
-    """
+def force_trust(X: FloatArray, elements: IntArray, uncertainty: Mapping[str, Any] | None = None) -> ForceTrust:
+    """Trust in forces from elements (m, 4 or 10) by their number across the thinnest walls: model.md section 5."""
     order = 1 if elements.shape[1] == 4 else 2
-    corners = X[elements[:, :4]]
-    edge = float(np.mean(np.linalg.norm(corners[:, [1, 2, 3]] - corners[:, [0, 0, 0]], axis=2)))
-    across = wall / edge
+    tets = elements[:, :4]
+    found = walls(X[: int(tets.max()) + 1], tets)
+    across = min(found.fewest(COARSE_SHARE), MOST_COUNTED)
     counts, ratios = np.array(LINEAR_FLEXIBILITY if order == 1 else QUADRATIC_FLEXIBILITY).T
-    return ForceTrust(order, across, float(np.interp(across, counts, ratios)))
+    return ForceTrust(
+        element_order=order,
+        elements_across=across,
+        least_fraction=float(np.interp(across, counts, ratios)),
+        thin_share=found.thin_share(FEWEST_ELEMENTS),
+        thin_place=found.thinnest_place(X),
+        uncertainty=None if uncertainty is None else np.array(uncertainty["N"]),
+        method="" if uncertainty is None else uncertainty["method"],
+    )
 
 
 def limit_reasons(points: LoadPoints, max_force: float, max_points: int, pull_only: bool) -> list[str]:
@@ -107,6 +128,10 @@ def plan_summary(plan: RigPlan, reasons: list[str]) -> dict[str, Any]:
             "element_order": trust.element_order,
             "elements_across": trust.elements_across,
             "least_fraction": trust.least_fraction,
+            "thin_share": trust.thin_share,
+            "thin_place_mm": trust.thin_place.tolist(),
+            "uncertainty_N": None if trust.uncertainty is None else trust.uncertainty.tolist(),
+            "method": trust.method,
         },
         "schedule": [_step_summary(step) for step in plan.steps],
         "checks": [

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fab4d.mesh.tetmesh import IntArray
+from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.rig.points import LoadPoints
 
 FORCE_COLUMNS = (
@@ -20,13 +20,16 @@ FORCE_COLUMNS = (
     "elevation_deg",
     *(f"hold_{a}_mm" for a in "xyz"),
     "travel_mm",
+    "force_uncertainty_N",
 )
 
 
-def force_rows(points: LoadPoints, vertex_map: IntArray) -> list[dict[str, float]]:
+def force_rows(
+    points: LoadPoints, vertex_map: IntArray, uncertainty: FloatArray | None = None
+) -> list[dict[str, float]]:
     """One row a point with the columns `FORCE_COLUMNS`; points count from 1, `vertex` from 0 in the permanent file.
 
-    vertex_map : (n,) number in the permanent file of each vertex
+    vertex_map : (n,) number in the permanent file of each vertex        uncertainty : (K,) of the forces, N; None: nan
     """
     columns = np.column_stack(
         [
@@ -44,6 +47,7 @@ def force_rows(points: LoadPoints, vertex_map: IntArray) -> list[dict[str, float
             points.elevation,
             points.hold,
             points.travel,
+            np.full(points.count, np.nan) if uncertainty is None else uncertainty,
         ]
     )
     whole = ("point", "vertex")

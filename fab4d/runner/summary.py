@@ -24,12 +24,23 @@ def _cost(projection: Mapping[str, Any]) -> str:
     return f"RMS {projection['rms_mm']:.3g} mm, max {projection['max_mm']:.3g} mm from the wanted one"
 
 
+def _change_text(change: Mapping[str, Any]) -> str:
+    linear, quadratic = max(change["linear_N"]), max(change["quadratic_N"])
+    return f"the largest {linear:.3g} N in linear elements, {quadratic:.3g} N in quadratic ones at the same positions"
+
+
+def _uncertainty_text(uncertainty: Mapping[str, Any]) -> str:
+    return f"+- {max(uncertainty['N']):.2g} N ({100 * uncertainty['largest']:.0f} %) by {uncertainty['method']}"
+
+
 _FIGURES: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "target_displacement_mm": ("to move", lambda value: f"{value:.3g} mm"),
     "target_projection": ("nearest", lambda value: f"the nearest shape that the part can take: {_cost(value)}"),
     "error": ("error", _error_text),
     "smp_fraction": ("SMP", lambda value: f"{100 * value:.1f} % of the volume"),
     "forces": ("forces", lambda value: f"{value} points"),
+    "force_change": ("", _change_text),
+    "force_uncertainty": ("", _uncertainty_text),
     "mass_g": ("mass", lambda value: f"{value:.3g} g"),
     "cost_usd": ("cost", lambda value: f"{value:.2f} USD"),
     "wall_s": ("time", duration),

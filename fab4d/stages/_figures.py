@@ -48,6 +48,8 @@ def figures_of(
         "equilibrium_residual": verify.get("equilibrium_residual", {"median": None, "final": None}),
         "min_det_F": verify.get("min_det_F"),
         "element_order": verify.get("element_order"),
+        "force_change": verify.get("force_change"),
+        "force_uncertainty": verify.get("force_uncertainty"),
         "mass_g": mass,
         "cost_usd": cost,
     }

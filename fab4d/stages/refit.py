@@ -20,28 +20,20 @@ from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import face_area_vectors, tet_volumes
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
+from fab4d.stages._element import element_for
 from fab4d.stages.monitor import Monitor
 from fab4d.stages.threshold import labels_for
 
 # How often the held positions are fitted again after the loading has found another equilibrium than the fit.
 MOST_FITS = 3
 Polish = Callable[[Design], Design]
-LEFT_OUT = {
-    "linear": [
-        {
-            "what": "quadratic elements",
-            "why": 'the last fit uses linear ones ([solver] element = "quadratic" changes that)',
-        }
-    ],
-    "quadratic": [],
-}
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
     smp = rounded["smp"].astype(np.float64)
-    element = profile["solver"].element
+    element, left_out = element_for(mesh, profile["solver"].element)
     problem = problem_of(mesh, profile["materials"], element)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
     trace = Trace(problem, mesh, monitor, tau_seconds(problem))
@@ -62,7 +54,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "fits": fits,
         "flipped_fraction": float(problem.volume_fractions[smp != rounded["smp"]].sum()),
         "reasons": reasons,
-        "left_out": LEFT_OUT[element],
+        "left_out": left_out,
     }
     return {
         "labels": {"smp": smp, "cluster": smp_clusters(mesh["tets"], volumes, smp)},

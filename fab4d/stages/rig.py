@@ -19,10 +19,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     if state is None or len(state["patch_center"]) == 0:
         return _nothing_to_set_up()
     monitor.progress("plan")
-    plan = rig_plan(state, profile["materials"])
+    plan = rig_plan(state, profile["materials"], inputs["verify_report"]["force_uncertainty"])
     rig = profile["rig"]
     reasons = limit_reasons(plan.points, rig.max_force, rig.max_points, rig.pull_only)
     monitor.progress("sheet", forces=plan.points.count)
+    rows = force_rows(plan.points, inputs["mesh"]["vertex_map"], plan.trust.uncertainty)
     return {
         "rig_sheet": rig_sheet(
             profile["name"],
@@ -33,7 +34,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
             inputs["verdict_report"]["reasons"],
             profile["printer"].up,
         ),
-        "forces_csv": csv_bytes(FORCE_COLUMNS, force_rows(plan.points, inputs["mesh"]["vertex_map"])),
+        "forces_csv": csv_bytes(FORCE_COLUMNS, rows),
         "rig_report": plan_summary(plan, reasons),
     }
 

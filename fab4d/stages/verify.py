@@ -12,15 +12,19 @@ from fab4d.design.problem import Problem
 from fab4d.mesh.distance import shape_error
 from fab4d.mesh.measures import vertex_areas
 from fab4d.mesh.tetmesh import FloatArray
-from fab4d.stages._design import patch_arrays, patches_of, problem_of
+from fab4d.stages._design import patch_arrays, patches_of
+from fab4d.stages._element import problem_like
+from fab4d.stages._forces import Held, force_report
 from fab4d.stages.monitor import Monitor
+
+NO_FORCES: dict[str, Any] = {"force_change": None, "force_uncertainty": None, "left_out": []}
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Load step by step from the permanent shape, cool, unload; measure what comes out."""
     mesh, printed, materials = inputs["mesh"], inputs["printed"], profile["materials"]
     smp = inputs["labels"]["smp"].astype(np.float64)
-    problem = problem_of(mesh, materials, profile["solver"].element)
+    problem = problem_like(mesh, materials, printed["x"])
     equilibria = Equilibria(problem, patches_of(problem, printed))
     monitor.progress("load")
     x = printed["x"] / problem.length
@@ -40,7 +44,10 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "reached": not _path_reasons(problem, done, x),
         "reasons": reasons,
     }
-    return {"state": _state(equilibria, smp, done), "verify_report": report}
+    monitor.progress("forces")
+    held = Held(equilibria, smp, done.median.x, done.median.forces)
+    trust = force_report(mesh, materials, printed, held) if equilibria.patches.count else NO_FORCES
+    return {"state": _state(equilibria, smp, done), "verify_report": report | trust}
 
 
 def _path_reasons(problem: Problem, done: Programming, x: FloatArray) -> list[str]:

@@ -103,7 +103,7 @@ REFUSALS = [
     (MINIMAL + "[goal]\nmax_forces = 2.5", r"max_forces must be a whole number from 1 up, not 2\.5"),
     (MINIMAL + "[goal]\nmax_forces = 17", r'max_forces is 17, but the rig "bench" pulls at most 16'),
     (MINIMAL + "[goal]\nmax_smp_fraction = 1.1", r"max_smp_fraction must be a number from 0 to 1, not 1\.1"),
-    (MINIMAL + "[solver]\nelement = 'cubic'", r'element must be "linear" or "quadratic"'),
+    (MINIMAL + "[solver]\nelement = 'cubic'", r'element must be "auto" or "linear" or "quadratic"'),
     (MINIMAL + "[materials]\ncard = 'paper-corected'", r'no card "paper-corected" .* did you mean "paper-corrected"'),
     (MINIMAL + "[materials]\ncard = 'mine.toml'", r"mine\.toml: cannot be read"),
     (MINIMAL + "[rig]\nclamp = {box = 1}", r"written \[\[rig\.clamp\]\]"),

@@ -20,7 +20,8 @@ from fab4d.stages.report import run
 FIELDS = [
     *("verdict", "reasons", "error", "target_displacement_mm", "target_projection", "smp_fraction", "forces"),
     *("ambiguous_fraction", "isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual"),
-    *("min_det_F", "element_order", "mass_g", "cost_usd", "sensitivity", "printing", "tau_s", "wall_s"),
+    *("min_det_F", "element_order", "force_change", "force_uncertainty", "mass_g", "cost_usd", "sensitivity"),
+    *("printing", "tau_s", "wall_s"),
     *("peak_rss_mb", "findings", "left_out", "stages", "versions", "inputs"),
 ]
 
@@ -42,6 +43,19 @@ def test_the_cost_of_a_projected_target_is_told_and_part_of_the_error(inputs, pr
     assert result["report_json"]["target_projection"] == {"rms_mm": 0.123, "max_mm": 0.5}
     assert result["report_json"]["error"]["rms_mm"] > before["error"]["rms_mm"]
     assert b"0.123 mm" in result["report_html"]
+
+
+def test_the_trust_in_the_forces_is_told(inputs, profile):
+    change = {"linear_N": [800.0, 90.0], "quadratic_N": [517.0, 80.0], "largest": 0.5}
+    uncertainty = {"method": "a finer mesh", "order": 2, "N": [31.4, 2.0], "relative": [0.06, 0.03], "largest": 0.06}
+    inputs["verify_report"] |= {"force_change": change, "force_uncertainty": uncertainty}
+    result = run(inputs, profile, SilentMonitor())
+    assert result["report_json"]["force_change"] == change
+    assert result["report_json"]["force_uncertainty"] == uncertainty
+    assert b"800 / 517 N" in result["report_html"]
+    printed = "\n".join(report_lines(result["report_json"]))
+    assert "800 N in linear elements, 517 N in quadratic ones" in printed
+    assert "+- 31 N (6 %) by a finer mesh" in printed
 
 
 def test_what_the_doctor_found_is_told(inputs, profile):

@@ -1,5 +1,7 @@
 """The drawing under the rig sheet: depth, labels, words; and the sheet as a file."""
 
+import csv
+import io
 import re
 import zlib
 from base64 import a85decode
@@ -24,8 +26,9 @@ from fab4d.stages.rig import run
 
 @pytest.fixture
 def rig_run(bar, profile):
-    def go(state, name="bent-bar", sensitivity=None, rejected=(), up=(0.0, 0.0, 1.0)):
+    def go(state, name="bent-bar", sensitivity=None, rejected=(), up=(0.0, 0.0, 1.0), uncertainty=None):
         inputs = {"mesh": bar.mesh_artifact(), "labels": bar.labels_artifact(), "state": state}
+        inputs["verify_report"] = {"force_uncertainty": uncertainty}
         inputs["sensitivity_report"] = sensitivity or {"left_out": [], "reasons": []}
         inputs["verdict_report"] = {"reasons": list(rejected)}
         printer = replace(load_printer("generic-dual-0.4", Path()), up=up)
@@ -133,6 +136,19 @@ def test_sheet_says_what_the_bench_needs(bar, rig_run):
     ):
         assert words in text
     assert not re.search(r"(?<![\d.])-0\.?0*(?![\d.])", text)
+
+
+def test_sheet_tells_the_uncertainty_of_each_force(rig_run, bar):
+    state = bar.state_artifact()
+    count = len(state["patch_center"])
+    newton = [12.3 + k for k in range(count)]
+    result = rig_run(state, uncertainty={"N": newton, "method": "a finer mesh"})
+    text = pdf_text(result["rig_sheet"])
+    assert all(f"\\261 {round(value)}" in text for value in newton)
+    assert "by comparison with a finer mesh" in " ".join(text.split())
+    assert result["rig_report"]["force_trust"]["uncertainty_N"] == newton
+    rows = list(csv.DictReader(io.StringIO(result["forces_csv"].decode())))
+    assert [float(row["force_uncertainty_N"]) for row in rows] == pytest.approx(newton)
 
 
 def test_equal_states_give_equal_bytes(bar, rig_run):

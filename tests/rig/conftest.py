@@ -1,4 +1,5 @@
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -6,6 +7,9 @@ import pytest
 
 from fab4d.io.cards import load_material
 from fab4d.materials.cards import MaterialCard
+
+# The shapes of the samples, which are no package.
+sys.path.insert(0, str(Path(__file__).parents[2] / "samples"))
 
 
 @pytest.fixture(scope="session")

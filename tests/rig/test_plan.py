@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shapes.boxes import box
 
 from fab4d.io.csvtable import csv_bytes, read_csv
+from fab4d.mesh.quadratic import quadratic_tets, with_midpoints
 from fab4d.mesh.topology import face_table
 from fab4d.rig.clamp import clamp_of, corner_mark
 from fab4d.rig.plan import force_trust, limit_reasons, plan_summary, rig_plan
@@ -143,13 +145,35 @@ def test_checks_are_true_distances_and_well_apart(bar, card):
     assert np.min(np.abs(checks.median - checks.permanent)) > 1.0
 
 
-def test_force_trust_grows_with_elements(bar):
-    """Linear tets across a thin wall are not to be trusted, quadratic ones are."""
-    linear, quadratic = bar.state_artifact(), bar.state_artifact(quadratic=True)
-    thin = force_trust(linear["nodes"], linear["elements"], 2.5)
-    thick = force_trust(linear["nodes"], linear["elements"], 10.0)
-    assert thin.least_fraction < 0.2 < thick.least_fraction < 1
-    assert force_trust(quadratic["nodes"], quadratic["elements"], 2.5).least_fraction > 0.9
+@pytest.mark.parametrize(("cells", "fraction"), [((10, 1, 1), 0.15), ((10, 2, 2), 0.37), ((10, 3, 4), 0.52)])
+def test_force_trust_is_that_of_the_thinnest_walls(cells, fraction):
+    """A bar of n cells across: the table of model.md section 5, by the side that fewer cells span."""
+    X, tets = box((40.0, 10.0, 10.0), cells, "six")
+    trust = force_trust(X, tets)
+    assert (trust.element_order, trust.elements_across) == (1, pytest.approx(min(cells)))
+    assert trust.least_fraction == pytest.approx(fraction)
+    assert (trust.thin_share > 0.8) == (min(cells) == 1)
+    quadratic = force_trust(*_quadratic(X, tets))
+    assert quadratic.elements_across == pytest.approx(min(cells))
+    assert quadratic.least_fraction > 0.92
+
+
+def _quadratic(X, tets):
+    elements, edges = quadratic_tets(tets, len(X))
+    return with_midpoints(X, edges), elements
+
+
+def test_the_place_with_the_fewest_elements_is_told():
+    """A step: one cell thick beyond x = 20, four before."""
+    X, tets = box((40.0, 10.0, 8.0), (8, 2, 4), "six")
+    center = X[tets].mean(axis=1)
+    kept = tets[(center[:, 0] < 20) | (center[:, 2] < 2)]
+    used, numbers = np.unique(kept, return_inverse=True)
+    trust = force_trust(X[used], numbers.reshape(-1, 4))
+    assert trust.elements_across == pytest.approx(1.0)
+    assert trust.thin_place[0] > 20
+    assert trust.thin_place[2] in (0.0, 2.0)
+    assert 0.2 < trust.thin_share < 0.8
 
 
 def test_limits_of_the_rig():

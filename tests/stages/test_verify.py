@@ -11,7 +11,6 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.io.cards import load_material
-from fab4d.io.scene import SolverSettings
 from fab4d.stages._design import patch_arrays, problem_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.verify import run
@@ -56,7 +55,7 @@ def printed(scene: Arrays, labels: Arrays) -> Arrays:
 def verified(scene: Arrays, labels: Arrays, printed: Arrays, card: Any = CARD) -> tuple[Arrays, dict[str, Any]]:
     result = run(
         {"mesh": scene, "labels": labels, "printed": printed},
-        {"materials": card, "solver": SolverSettings()},
+        {"materials": card},
         SilentMonitor(),
     )
     return result["state"], result["verify_report"]
