@@ -44,11 +44,10 @@ def fewest_points(pair: Pair, clamp: BoolArray, wanted: FloatArray, tolerance: f
 
 
 def point_findings(
-    pair: Pair, clamp: BoolArray, wanted: FloatArray, tolerance: float, goal: Goal, rig: RigCard
+    pair: Pair, fewest: int, costs: FloatArray, tolerance: float, goal: Goal, rig: RigCard
 ) -> list[Finding]:
-    """A warning when the scene allows fewer points than its limbs need."""
+    """A warning when the scene allows fewer points than its limbs need; fewest, costs are of `fewest_points`."""
     allowed = rig.max_points if goal.max_forces is None else min(goal.max_forces, rig.max_points)
-    fewest, costs = fewest_points(pair, clamp, wanted, tolerance)
     if fewest <= allowed:
         return []
     message = (

@@ -32,7 +32,7 @@ from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_co
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
 from fab4d.report.verdict import DEFAULT_TOLERANCE
-from fab4d.stages._advice import clamp_findings, point_findings, suggested_clamp, travel_findings
+from fab4d.stages._advice import clamp_findings, fewest_points, point_findings, suggested_clamp, travel_findings
 from fab4d.stages._target import Target, reachable_target
 from fab4d.stages.monitor import Monitor
 from fab4d.units import MM_PER_UNIT, mm_per
@@ -64,17 +64,20 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     clamp = resolve_clamp(profile["clamp"], pair, permanent)
     nothing_to_program, found = check_motion(pair, clamp)
     findings += [*_refuse(found), *_refuse(check_boundary(pair, clamp))]
-    target, suggested, tolerance = Target(pair, []), None, _tolerance(profile["goal"], pair)
+    target, suggested, fewest = Target(pair, []), None, 0
+    tolerance = _tolerance(profile["goal"], pair)
     if not nothing_to_program:
         monitor.progress("target")
         target = reachable_target(pair, clamp, profile["materials"], tolerance)
         findings += [*_refuse(target.findings), *_strong_deformation(target.pair, profile["materials"])]
         monitor.progress("outlook")
         suggested = None if clamp.any() else suggested_clamp(target.pair, tolerance, profile["units"])
-        findings += [*_outlook(target, clamp, tolerance, profile), *clamp_findings(target.pair, suggested)]
+        fewest, found = _outlook(target, clamp, tolerance, profile)
+        findings += [*found, *clamp_findings(target.pair, suggested)]
     monitor.progress("self-intersection")
     findings += _refuse(_self_intersections(target.pair, nothing_to_program))
-    report = _report(target, clamp, profile["goal"], findings, nothing_to_program) | {"suggested_clamp": suggested}
+    report = _report(target, clamp, profile["goal"], findings, nothing_to_program)
+    report |= {"fewest_points": fewest, "suggested_clamp": suggested}
     return {"mesh": _arrays(target, clamp), "check_report": report}
 
 
@@ -96,13 +99,18 @@ def _self_intersections(pair: Pair, nothing_to_program: bool) -> list[Finding]:
     return check_crossings(pair, pair.X_temp, pair.files[1], "warning", advice)
 
 
-def _outlook(target: Target, clamp: BoolArray, tolerance: float, profile: Mapping[str, Any]) -> list[Finding]:
+def _outlook(
+    target: Target, clamp: BoolArray, tolerance: float, profile: Mapping[str, Any]
+) -> tuple[int, list[Finding]]:
+    """The fewest points that the limbs need, and what limits the scene."""
     pair, rig = target.pair, profile["rig"]
     wanted = pair.X_temp if target.wanted is None else target.wanted
-    return [
-        *point_findings(pair, clamp, wanted, tolerance, profile["goal"], rig),
+    fewest, costs = fewest_points(pair, clamp, wanted, tolerance)
+    found = [
+        *point_findings(pair, fewest, costs, tolerance, profile["goal"], rig),
         *travel_findings(pair, clamp, rig),
     ]
+    return fewest, found
 
 
 def _tolerance(goal: Goal, pair: Pair) -> float:

@@ -526,6 +526,7 @@ def test_each_limb_that_bends_needs_a_point(bends: list[float], points: int, eno
     x, y, tets = comb(bends)
     _, report = check_points(x, y, tets, clamp=PLATE, max_forces=points)
     assert ("too-few-points" not in codes(report)) == enough
+    assert report["fewest_points"] == 3
     if not enough:
         assert "3 limbs change their own shape" in codes(report)["too-few-points"]["message"]
         assert codes(report)["too-few-points"]["severity"] == "warning"
