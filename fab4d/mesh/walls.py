@@ -10,6 +10,9 @@ from fab4d.mesh.topology import FaceTable, face_table
 
 # A wall's far side faces away from the near side within 45 degrees: a cut across an edge of the part is no wall.
 OPPOSITE = -0.7
+# Fewer elements across a wall are worth a warning: two of an irregular mesh. Small details, of this share of the walls'
+# area, may have fewer.
+FEWEST_ELEMENTS, COARSE_SHARE = 1.9, 0.05
 # Narrow margin inside which a ray through an edge counts as inside a tet.
 _MARGIN = 1e-9
 

@@ -9,7 +9,7 @@ import numpy as np
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import face_table
-from fab4d.mesh.walls import walls
+from fab4d.mesh.walls import COARSE_SHARE, FEWEST_ELEMENTS, walls
 from fab4d.rig.checks import CaliperChecks, caliper_checks
 from fab4d.rig.clamp import Clamp, clamp_of, corner_mark
 from fab4d.rig.points import LoadPoints, load_points
@@ -20,8 +20,6 @@ LINEAR_FLEXIBILITY = ((1.0, 0.15), (2.0, 0.37), (4.0, 0.67), (8.0, 0.87))
 # The same by quadratic tets.
 QUADRATIC_FLEXIBILITY = ((1.0, 0.93), (2.0, 0.97), (8.0, 1.0))
 
-# Fewer elements across a wall than this are worth a warning. It may hold for a share of small details.
-FEWEST_ELEMENTS, COARSE_SHARE = 1.9, 0.05
 # A part without opposite walls has no number of elements across them.
 MOST_COUNTED = 100.0
 

@@ -7,13 +7,11 @@ import numpy as np
 
 from fab4d.design.problem import Problem
 from fab4d.mesh.topology import unique_edges
-from fab4d.mesh.walls import walls
+from fab4d.mesh.walls import COARSE_SHARE, walls
 from fab4d.stages._design import problem_of
 
 # Bars of 8 linear tets across bend to 0.87 of the true flexibility (model.md section 5): forces are at most 15 % large.
 FINE_ELEMENTS = 8.0
-# Share of the walls' area, that of small details, that may be coarser.
-COARSE_SHARE = 0.05
 # More unknowns take longer than a design is worth: at 55,000 a factorisation takes 1 s and 0.2 GB, at 120,000 some 4 s
 # and 0.7 GB, and a fit with its verification some 200 of them.
 MOST_QUADRATIC_DOFS = 120_000

@@ -11,7 +11,8 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.io.cards import load_material
-from fab4d.stages._design import patch_arrays, problem_of
+from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.stages._design import patch_arrays, patches_of, problem_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.verify import run
 
@@ -69,6 +70,34 @@ def test_a_design_is_reached_and_its_state_told(scene: Arrays, labels: Arrays, p
     np.testing.assert_allclose(state["x"], printed["x"], atol=1e-7)
     np.testing.assert_allclose(state["patch_force"], printed["patch_force"], rtol=1e-6)
     np.testing.assert_array_equal(state["x"][state["clamp"]], scene["X"][scene["clamp"]])
+
+
+def test_a_quadratic_fit_is_verified_in_quadratic_elements(scene: Arrays, labels: Arrays, printed: Arrays) -> None:
+    """The state is that of a median problem built apart, solved from the wanted shape instead of by loading."""
+    problem = problem_of(scene, CARD, "quadratic")
+    equilibria = Equilibria(problem, patches_of(problem, printed))
+    rho = labels["smp"].astype(np.float64)
+    held = equilibria.patches.mean(problem.X_temp)
+    median = equilibria.solve_median(rho, held, problem.X_temp, np.zeros((4, 3)), 1e-12, 60)
+    final = equilibria.solve_final(rho, median, median.x, 1e-11, 60)
+    L0, design = problem.length, Design(rho, median, final)
+    quadratic = {"x": median.x * L0, "y": final.y * L0} | patch_arrays(problem, equilibria.patches, design)
+    state, report = verified(scene, labels, quadratic)
+    assert (report["element_order"], report["reasons"]) == (2, [])
+    assert state["elements"].shape[1] == 10
+    np.testing.assert_allclose(state["patch_force"], quadratic["patch_force"], rtol=1e-6)
+    np.testing.assert_allclose(state["y"], best_fit(state["y"], quadratic["y"]), atol=1e-7)
+    sizes = np.linalg.norm(state["patch_force"], axis=1)
+    assert report["force_change"]["quadratic_N"] == pytest.approx(sizes)
+    assert max(report["force_change"]["linear_N"]) > 1.1 * sizes.max()
+    assert report["force_uncertainty"]["method"] == "quadratic elements on a mesh refined 1:8"
+    assert 0 < report["force_uncertainty"]["largest"] < 0.5
+
+
+def best_fit(y: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The shape `other` (N, 3) moved rigidly onto y."""
+    R, t = best_rigid_motion(other, y)
+    return other @ R.T + t
 
 
 def test_forces_and_moments_of_points_and_clamp_balance(scene: Arrays, labels: Arrays, printed: Arrays) -> None:
