@@ -11,8 +11,8 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table, vertices_near
 
 # Weight of the surface and rings of vertices around inverted tets (None: all vertices), to try in turn: first the
-# surface is fixed, then held ever more softly, and what moves stays as local as it can.
-_INSIDE = ((np.inf, 3), (np.inf, 8))
+# surface is fixed (_INSIDE), or held ever more softly, and what moves stays as local as it can.
+_INSIDE = ((np.inf, 3), (np.inf, 5))
 _SURFACE = ((1e6, 3), (1e4, 3), (1e4, 8), (1e2, 8), (1e4, None), (1e2, None))
 _MAX_ROUNDS = 12
 
@@ -53,7 +53,7 @@ def untangle(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -> 
     boundary = face_table(tets).boundary
     areas = vertex_areas(X, boundary)
     best = target
-    attempts = _INSIDE if fixed[areas > 0].all() else _INSIDE + _SURFACE
+    attempts = _INSIDE if fixed[areas > 0].all() else _SURFACE
     for weight, rings in attempts:
         if not inverted.any() or _dets(best, tets, inverse).min() > 0:
             break

@@ -8,7 +8,7 @@ from fab4d.elasticity.untangle import untangle
 from fab4d.mesh.measures import deformation_gradients, edge_matrices
 
 CENTRE = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10], [2.5, 2.5, 2.5]])
-NONE = np.zeros(5, bool)
+NONE, SURFACE = np.zeros(5, bool), np.arange(5) < 4
 # One tet split in four at an inner vertex.
 TETS = np.array([[4, 1, 2, 3], [0, 4, 2, 3], [0, 1, 4, 3], [0, 1, 2, 4]])
 
@@ -40,7 +40,7 @@ def test_a_sound_shape_is_returned_as_it_is() -> None:
 def test_an_inner_vertex_is_brought_back_and_the_surface_stays(outside: list[float]) -> None:
     x = CENTRE.copy()
     x[4] = outside
-    mended = untangle(CENTRE, x, TETS, NONE)
+    mended = untangle(CENTRE, x, TETS, SURFACE)
     np.testing.assert_array_equal(mended.x[:4], CENTRE[:4])
     assert mended.surface_moved == 0
     # The best place by symmetry of the energy is near the centroid.
