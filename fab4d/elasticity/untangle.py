@@ -10,7 +10,7 @@ from fab4d.mesh.measures import bounding_box_diagonal, edge_matrices, vertex_are
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table, vertices_near
 
-# Weight of the surface and rings of vertices around inverted tets (None: all vertices), to try in turn: first the
+# Weight of the surface and rings of vertices around inverted tets (None: all vertices), to try in turn: the
 # surface is fixed (_INSIDE), or held ever more softly, and what moves stays as local as it can.
 _INSIDE = ((np.inf, 3), (np.inf, 5))
 _SURFACE = ((1e6, 3), (1e4, 3), (1e4, 8), (1e2, 8), (1e4, None), (1e2, None))
