@@ -113,9 +113,12 @@ def main() -> None:
 @_scene_command
 @click.option("--from", "first", type=click.Choice(stage_table().names), help="Take what earlier stages left as it is.")
 @click.option("--until", "last", type=click.Choice(stage_table().names), help="Stop after this stage.")
+@click.option("--pick", metavar="ROW", help="Go on from this row of `fab4d tradeoff`; none: search again.")
 @click.option("--force", is_flag=True, help="Run the stages even where they are current.")
 @click.option("--quiet", is_flag=True, help="Show no progress.")
-def run(scene: Path, out: Path | None, first: str | None, last: str | None, force: bool, quiet: bool) -> None:
+def run(
+    scene: Path, out: Path | None, first: str | None, last: str | None, pick: str | None, force: bool, quiet: bool
+) -> None:
     """Make the whole design. Finished stages are skipped, a stopped run goes on."""
     from fab4d.runner.runner import Selection
 
@@ -123,7 +126,23 @@ def run(scene: Path, out: Path | None, first: str | None, last: str | None, forc
     if not stages:
         msg = f"--from {first} comes after --until {last}: the order is {', '.join(stage_table().names)}"
         raise click.UsageError(msg)
-    _run(_open_job(scene, out), Selection(first, last, frozenset(stages if force else ())), quiet)
+    job = _open_job(scene, out)
+    if pick is not None:
+        _pick(job, pick, stages, quiet)
+    _run(job, Selection(first, last, frozenset(stages if force else ())), quiet)
+
+
+def _pick(job: "Job", row: str, stages: list[str], quiet: bool) -> None:
+    """Put the row in the place of what stage solve would search."""
+    from fab4d.runner.pick import pick_row
+    from fab4d.runner.runner import Selection, execute
+
+    if "solve" not in stages:
+        msg = f"--pick {row} takes the place of stage solve, which --from or --until leaves out"
+        raise click.UsageError(msg)
+    execute(job, Selection(last="check"), _display(quiet))
+    with job.workspace.locked():
+        pick_row(job, row)
 
 
 def _run(job: "Job", selection: "Selection", quiet: bool) -> None:
@@ -197,6 +216,45 @@ def plan(scene: Path, out: Path | None) -> None:
         doctor = _checked(_open_job(scene, Path(folder)))
         lines = plan_lines(_open_job(scene, out), doctor.load("mesh"), doctor.load("check_report"))
     click.echo("\n".join(lines))
+
+
+@main.command(cls=Command)
+@_scene_command
+@click.option("--points", metavar="N,N,...", help="Numbers of points; up to the goal's max_forces if not given.")
+@click.option("--prices", metavar="P,P,...", help="Prices of SMP, as multiples of the usual one (lam_SMP).")
+@click.option("--force", is_flag=True, help="Make finished rows again.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def tradeoff(scene: Path, out: Path | None, points: str | None, prices: str | None, force: bool, quiet: bool) -> None:
+    """Show what SMP and points buy: error of many designs, to pick one from.
+
+    Finished rows are kept, a stopped tradeoff goes on. `fab4d run SCENE --pick ROW` makes the design of a row.
+    """
+    from fab4d.runner.runner import execute_study
+    from fab4d.runner.tradeoff import tradeoff_summary
+
+    given = {"points": _numbers("--points", points, int), "prices": _numbers("--prices", prices, float)}
+    job = _open_job(scene, out)
+    most = job.scene.rig.max_points
+    if given["points"] and max(given["points"]) > most:
+        msg = f'--points {max(given["points"])}: the rig "{job.scene.rig.name}" pulls at most {most}'
+        raise click.UsageError(msg)
+    options = {name: values for name, values in given.items() if values is not None}
+    execute_study(job, "tradeoff", options, force, _display(quiet))
+    click.echo("\n".join(tradeoff_summary(job.workspace)))
+
+
+def _numbers(option: str, text: str | None, kind: type) -> tuple[Any, ...] | None:
+    """Numbers above 0 that are separated by commas."""
+    if text is None:
+        return None
+    try:
+        numbers = tuple(kind(word) for word in text.split(","))
+    except ValueError:
+        numbers = ()
+    if not numbers or not all(0 < number < float("inf") for number in numbers):
+        msg = f"{option} takes {'whole ' if kind is int else ''}numbers above 0 with commas between them, not {text!r}"
+        raise click.UsageError(msg)
+    return numbers
 
 
 @main.command(cls=Command, help=STAGE_HELP["check"])

@@ -114,11 +114,13 @@ class Job:
         return self.workspace.load(name) if self.workspace.exists(name) else self._absent(name)
 
     def _absent(self, name: str) -> None:
-        """None for an artifact that its stage did not need to write."""
-        writer = self.table.writer(name).name
-        manifest = self.workspace.manifest(writer)
+        """None for an artifact that its stage did not need to write, or that nobody picked."""
+        writer = self.table.writer(name)
+        if writer is None:
+            return
+        manifest = self.workspace.manifest(writer.name)
         if manifest is None or manifest["writes"][name] is not None:
-            msg = f"{self.workspace.path(name)} is missing: stage {writer} writes it, so run from {writer} on"
+            msg = f"{self.workspace.path(name)} is missing: stage {writer.name} writes it, so run from {writer.name} on"
             raise ArtifactError(msg)
 
     def _run_record(self, stage: Stage) -> dict[str, Any]:

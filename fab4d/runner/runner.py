@@ -13,6 +13,7 @@ from fab4d.runner.fingerprint import digest, staleness
 from fab4d.runner.job import Job, UndeclaredError
 from fab4d.runner.machine import peak_rss_mb
 from fab4d.runner.monitor import StageMonitor
+from fab4d.runner.pick import refuse_outdated_pick, study_rows
 from fab4d.runner.table import Stage
 from fab4d.runner.workspace import Checkpoints
 
@@ -46,7 +47,8 @@ def plan(job: Job, selection: Selection) -> list[Step]:
 
 def _step(job: Job, stage: Stage, selection: Selection, open_stages: set[str]) -> Step:
     artifacts = [name for name in stage.reads if name in job.table.artifacts]
-    awaited = [name for name in artifacts if job.table.writer(name).name in open_stages]
+    writers = {name: job.table.writer(name) for name in artifacts}
+    awaited = [name for name, writer in writers.items() if writer and writer.name in open_stages]
     reason = _reason(job, stage, selection, awaited)
     if reason:
         return Step(stage.name, "runs", reason)
@@ -68,9 +70,31 @@ def execute(job: Job, selection: Selection, display: Display) -> list[str]:
                 reason = _reason(job, stage, selection)
                 display.note(stage.name, f"runs: {reason}" if reason else "current")
                 if reason:
+                    refuse_outdated_pick(job, stage)
                     _run_stage(job, stage, stage.name in selection.forced, display)
                     ran.append(stage.name)
     return ran
+
+
+def execute_study(job: Job, name: str, options: Mapping[str, Any], forced: bool, display: Display) -> None:
+    """Run the stages that the study reads from, then the study; rows that it finished for the same inputs are kept.
+
+    Raises InterruptedRunError on Ctrl-C or SIGTERM, and whatever the study raises.
+    """
+    study = job.table.study(name)
+    writers = [writer.name for writer in map(job.table.writer, study.reads) if writer]
+    execute(job, Selection(last=max(writers, key=job.table.names.index)), display)
+    selection = Selection(forced=frozenset({name} if forced else ()))
+    with job.workspace.locked(), _sigterm_as_interrupt(), _resumable(job, study, selection):
+        rows = study_rows(job, study)
+        if forced:
+            rows.clear()
+        monitor = StageMonitor(name, rows, display)
+        results = job.stage_function(name)(job.inputs(study), job.profile(study), monitor, **options)
+        _check_writes(study, results)
+        job.workspace.save(results)
+        job.workspace.save_manifest(name, job.fingerprint(study) | {"writes": job.written(study)})
+        display.note(name, f"done in {duration(monitor.elapsed_s())}")
 
 
 def _reason(job: Job, stage: Stage, selection: Selection, unchanged: Sequence[str] = ()) -> str | None:

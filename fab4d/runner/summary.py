@@ -41,6 +41,7 @@ _FIGURES: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "forces": ("forces", lambda value: f"{value} points"),
     "force_change": ("", _change_text),
     "force_uncertainty": ("", _uncertainty_text),
+    "picked": ("picked", lambda row: f"row {row['id']} of the tradeoff"),
     "mass_g": ("mass", lambda value: f"{value:.3g} g"),
     "cost_usd": ("cost", lambda value: f"{value:.2f} USD"),
     "wall_s": ("time", duration),

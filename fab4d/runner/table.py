@@ -11,6 +11,8 @@ from fab4d.io.data import data_folder
 
 SOURCES = ("permanent", "temporary")
 RUN = "run"
+# What a person picked from a study; a stage reads it where there is one.
+PICKED = "picked"
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,11 @@ class Stage:
 
 @dataclass(frozen=True)
 class Table:
-    """Artifacts with their paths in the run folder, and the stages in order."""
+    """Artifacts with their paths in the run folder, the stages in order, and the studies, which no run needs."""
 
     artifacts: Mapping[str, str]
     stages: tuple[Stage, ...]
+    studies: tuple[Stage, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -39,9 +42,13 @@ class Table:
         """The stage called `name`."""
         return next(stage for stage in self.stages if stage.name == name)
 
-    def writer(self, artifact: str) -> Stage:
-        """The stage that writes `artifact`."""
-        return next(stage for stage in self.stages if artifact in stage.writes)
+    def study(self, name: str) -> Stage:
+        """The study called `name`."""
+        return next(study for study in self.studies if study.name == name)
+
+    def writer(self, artifact: str) -> Stage | None:
+        """The stage that writes `artifact`; None where a person decides it."""
+        return next((stage for stage in self.stages if artifact in stage.writes), None)
 
     def between(self, first: str | None, last: str | None) -> tuple[Stage, ...]:
         """The stages from `first` to `last`, both included; None is the table's end."""
@@ -60,7 +67,8 @@ def read_table(path: Path) -> Table:
     """The table in the TOML file `path`. Raises ValueError when it contradicts itself."""
     with path.open("rb") as file:
         content = tomllib.load(file)
-    table = Table(content["artifacts"], tuple(_stage(row) for row in content["stage"]))
+    stages, studies = (tuple(_stage(row) for row in content.get(kind, ())) for kind in ("stage", "study"))
+    table = Table(content["artifacts"], stages, studies)
     problem = next(_problems(table), None)
     if problem:
         msg = f"{path}: {problem}"
@@ -76,10 +84,11 @@ def _stage(row: Mapping[str, Any]) -> Stage:
 
 
 def _problems(table: Table) -> Iterator[str]:
-    known: set[str] = {*SOURCES, RUN}
-    if len(set(table.names)) != len(table.names):
-        yield f"a stage name occurs twice in {table.names}"
-    for stage in table.stages:
+    known: set[str] = {*SOURCES, RUN, PICKED}
+    names = [stage.name for stage in (*table.stages, *table.studies)]
+    if len(set(names)) != len(names):
+        yield f"a stage name occurs twice in {names}"
+    for stage in (*table.stages, *table.studies):
         yield from (f"stage {stage.name} reads {name} too early" for name in stage.reads if name not in known)
         yield from (f"stage {stage.name} writes {name} again" for name in stage.writes if name in known)
         yield from (f"{name} has no path in [artifacts]" for name in stage.writes if name not in table.artifacts)

@@ -35,6 +35,9 @@ class Workspace:
     def checkpoint_folder(self, stage: str) -> Path:
         return self.root / "work" / "checkpoints" / stage
 
+    def study_folder(self, study: str) -> Path:
+        return self.root / "work" / study
+
     @property
     def _lock_path(self) -> Path:
         return self.root / "work" / "lock"
@@ -104,8 +107,7 @@ class Checkpoints:
     def __init__(self, folder: Path, key: str) -> None:
         self.folder, self.key = folder, key
         self.spent_s = 0.0
-        mark = folder / "key.json"
-        kept = json.loads(mark.read_bytes()) if mark.is_file() else {}
+        kept = _mark(folder)
         if kept.get("key") == key:
             self.spent_s = float(kept["spent_s"])
         else:
@@ -127,6 +129,16 @@ class Checkpoints:
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"
+
+
+def kept_key(folder: Path) -> str | None:
+    """The key of the checkpoints in `folder`, None where there are none."""
+    return _mark(folder).get("key")
+
+
+def _mark(folder: Path) -> dict[str, Any]:
+    path = folder / "key.json"
+    return cast("dict[str, Any]", json.loads(path.read_bytes())) if path.is_file() else {}
 
 
 def read_file(path: Path) -> Any:

@@ -410,7 +410,7 @@ def _left_out(target: Target, clamp: BoolArray, goal: Goal, nothing_to_program: 
     if target.projection is None and not nothing_to_program:
         left_out.append({"what": "projection of the temporary shape", "why": "an elastic part can take it as it is"})
     if goal.smp == "enough" and not nothing_to_program:
-        why = 'the first design that meets the goal is taken ([goal] smp = "least" searches on)'
+        why = 'the scene does not ask for it ([goal] smp = "least" does)'
         left_out.append({"what": "search for the least SMP", "why": why})
     if nothing_to_program:
         why = "the temporary shape is the permanent one, moved rigidly"

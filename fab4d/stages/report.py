@@ -85,11 +85,13 @@ def _findings(check_report: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, Any]:
-    run, tau_s = inputs["run"], (inputs["solve_report"] or {}).get("tau_s")
+    solve = inputs["solve_report"] or {}
+    run, tau_s = inputs["run"], solve.get("tau_s")
     stages = [
         {"name": s["name"], "wall_s": s["wall_s"], "tau": s["wall_s"] / tau_s if tau_s else None} for s in run["stages"]
     ]
     return {
+        "picked": solve.get("picked"),
         "tau_s": tau_s,
         "wall_s": run["wall_s"],
         "peak_rss_mb": run["peak_rss_mb"],

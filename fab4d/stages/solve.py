@@ -1,5 +1,6 @@
 """Stage `solve`: a near 0/1 density and the points to hold, so that the part takes the temporary shape."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,6 +40,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
             {"what": "design, forces and rig sheet", "why": "the temporary shape is the permanent one, moved rigidly"}
         ]
         return _artifacts(problem, rest, trace, {"tau_s": tau_s, "left_out": why})
+    if inputs["picked"] is not None:
+        return _picked(problem, profile["rig"], inputs["picked"], trace, tau_s)
     found, attempts, rms = _search(problem, mesh, profile, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
@@ -55,6 +58,16 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "left_out": LEFT_OUT,
     }
     return _artifacts(problem, found, trace, report)
+
+
+def _picked(
+    problem: Problem, rig: RigCard, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float
+) -> dict[str, Any]:
+    """The design of a row of the tradeoff, as if it had been searched."""
+    row, found = json.loads(str(picked["row"])), search_from(problem, rig, picked)
+    trace.add("picked", found)
+    left_out = [{"what": "search for a design", "why": f"row {row['id']} of the tradeoff is picked"}]
+    return _artifacts(problem, found, trace, {"tau_s": tau_s, "picked": row, "left_out": left_out})
 
 
 def _refuse_weights(weights: Weights, goal: Goal) -> None:

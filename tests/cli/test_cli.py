@@ -14,6 +14,8 @@ from click.testing import CliRunner, Result
 
 from fab4d import __version__, errors
 from fab4d.cli import USAGE_EXIT_CODE, main
+from fab4d.io.csvtable import csv_bytes
+from fab4d.report.tradeoff import COLUMNS
 from fab4d.runner.table import stage_table
 
 HEAVY = {"numpy", "scipy", "numba", "meshio", "trimesh", "manifold3d", "reportlab", "matplotlib", "PIL", "rslab"}
@@ -266,3 +268,89 @@ def test_bench_compares_the_finished_runs_and_draws_them(scene: Path, stages: di
     assert (tmp_path / "plots" / "all.png").read_bytes().startswith(b"\x89PNG")
     assert fab4d("bench", "runs/other", "--markdown").stdout.splitlines()[-1].startswith("| other | 1 | 8 |")
     assert fab4d("bench", scene).exit_code == errors.ArtifactError.exit_code
+
+
+# -- a row of a tradeoff, picked
+
+
+@pytest.fixture
+def picked(stages: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What stage solve was given as picked; the study makes the rows that it is asked for."""
+    stages["solve_report"] = {"tau_s": 1.0}
+    given: list[Any] = []
+    solve = sys.modules["fab4d.stages.solve"].run
+
+    def watched(inputs: Mapping[str, Any], profile: Any, monitor: Any) -> dict[str, Any]:
+        given.append(inputs["picked"])
+        return solve(inputs, profile, monitor)
+
+    def study(_inputs: Any, _profile: Any, monitor: Any, points: Any = (4,), prices: Any = (1.0,)) -> dict[str, Any]:
+        index = monitor.restore("index")
+        names = [f"{count}x{price:g}" for count in points for price in prices]
+        for name in names:
+            monitor.save(name, {"rho": np.full(2, float(name[0])), "row": np.array(f'{{"id": "{name}"}}')})
+        monitor.save("index", {"names": np.array([*(index["names"] if index else ()), *names])})
+        figures = {"points": 4, "smp_fraction": 0.2, "cost_usd": 1.0, "rms_mm": 0.1, "max_force_N": 9.0}
+        row = dict.fromkeys(COLUMNS, "") | figures | {"id": names[0], "acceptable": "yes"}
+        csv = csv_bytes(COLUMNS, [row])
+        return {"tradeoff_csv": csv, "tradeoff_plot": b"", "tradeoff_report": {"without_a_design": ["2 points: none"]}}
+
+    monkeypatch.setattr(sys.modules["fab4d.stages.solve"], "run", watched)
+    module = ModuleType("tradeoff")
+    module.run = study  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fab4d.stages.tradeoff", module)
+    return given
+
+
+def test_a_picked_row_takes_the_place_of_the_search_until_it_is_taken_back(scene: Path, picked: list[Any]) -> None:
+    told = fab4d("tradeoff", scene, "--points", "4,6", "--prices", "1,2")
+    assert told.exit_code == 0, told.output
+    assert "2 points: none" in told.output
+    assert "the least SMP has row 4x1" in told.output
+    assert fab4d("run", scene, "--pick", "6x2").exit_code == 0
+    np.testing.assert_array_equal(picked[-1]["rho"], [6.0, 6.0])
+    assert fab4d("run", scene).exit_code == 0  # still picked, so there is nothing to do
+    assert len(picked) == 1
+    assert fab4d("tradeoff", scene, "--points", "8").exit_code == 0
+    assert fab4d("run", scene).exit_code == 0  # more rows do not change the picked one
+    assert len(picked) == 1
+    assert fab4d("run", scene, "--pick", "none").exit_code == 0
+    assert picked[1:] == [None]
+
+
+def test_what_cannot_be_picked_says_why(scene: Path, picked: list[Any]) -> None:
+    missing = fab4d("run", scene, "--pick", "4x1")
+    assert missing.exit_code == errors.ArtifactError.exit_code
+    assert "run `fab4d tradeoff`" in missing.output
+    fab4d("tradeoff", scene)
+    unknown = fab4d("run", scene, "--pick", "4x3")
+    assert unknown.exit_code == errors.ArtifactError.exit_code
+    assert 'no row 4x3; did you mean "4x1"?' in unknown.output
+    for unpickable in ("index", "../../lock"):
+        assert fab4d("run", scene, "--pick", unpickable).exit_code == errors.ArtifactError.exit_code
+    assert picked == []
+
+
+@pytest.mark.parametrize("pick", [("--pick", "4x1"), ()])
+def test_a_row_of_other_inputs_is_refused(scene: Path, picked: list[Any], pick: tuple[str, ...]) -> None:
+    fab4d("tradeoff", scene)
+    assert fab4d("run", scene, "--pick", "4x1").exit_code == 0
+    (scene / "scene.toml").write_text(SCENE + "[goal]\nmax_forces = 5\n")
+    refused = fab4d("run", scene, *pick)
+    assert refused.exit_code == errors.ArtifactError.exit_code
+    assert "other inputs (goal changed)" in refused.output
+    assert len(picked) == 1
+    assert fab4d("run", scene, "--pick", "none").exit_code == 0
+    assert picked[1:] == [None]
+
+
+@pytest.mark.parametrize("where", [("--from", "threshold"), ("--until", "check")])
+def test_a_pick_that_no_stage_would_use_is_refused(scene: Path, where: tuple[str, str]) -> None:
+    assert fab4d("run", scene, "--pick", "4x1", *where).exit_code == USAGE_EXIT_CODE
+
+
+@pytest.mark.parametrize("options", [("--points", "4,x"), ("--points", "0"), ("--prices", "-1"), ("--points", "900")])
+def test_mistyped_numbers_of_a_tradeoff_are_refused(scene: Path, options: tuple[str, str]) -> None:
+    result = fab4d("tradeoff", scene, *options)
+    assert result.exit_code == USAGE_EXIT_CODE
+    assert options[0] in result.output

@@ -1,11 +1,32 @@
-"""A mesh for stages that need one."""
+"""A mesh for stages that need one, and a monitor with a memory."""
 
+from collections.abc import Mapping
 from itertools import permutations
 
 import numpy as np
 import pytest
 
 from fab4d.mesh.measures import tet_volumes
+from fab4d.stages.monitor import SilentMonitor
+
+
+class Memory(SilentMonitor):
+    """A monitor that restores what it saved."""
+
+    def __init__(self, saved: Mapping[str, Mapping[str, np.ndarray]] | None = None) -> None:
+        self.saved = dict(saved or {})
+
+    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        self.saved[name] = {key: np.array(value) for key, value in arrays.items()}
+
+    def restore(self, name: str) -> Mapping[str, np.ndarray] | None:
+        return self.saved.get(name)
+
+
+@pytest.fixture(scope="session")
+def memory() -> type[Memory]:
+    """The class of monitors with a memory."""
+    return Memory
 
 
 @pytest.fixture(scope="module")

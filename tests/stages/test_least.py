@@ -17,19 +17,7 @@ from fab4d.stages import _least, check, solve
 from fab4d.stages.monitor import SilentMonitor
 
 STRIP = Path(__file__).parents[2] / "samples" / "strip"
-
-
-class Memory(SilentMonitor):
-    """A monitor that restores what it saved."""
-
-    def __init__(self, saved: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-        self.saved = {name: dict(arrays) for name, arrays in saved.items()}
-
-    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
-        self.saved[name] = {key: np.array(value) for key, value in arrays.items()}
-
-    def restore(self, name: str) -> dict[str, np.ndarray] | None:
-        return self.saved.get(name)
+Searched = tuple[dict[str, Any], Any]
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +40,19 @@ def check_stage(scene: Scene) -> dict[str, Any]:
 
 def solved(scene: Scene, checked: Mapping[str, Any], monitor: SilentMonitor) -> dict[str, Any]:
     profile = {name: getattr(scene, name) for name in stage_table().stage("solve").profile}
-    return solve.run(dict(checked), profile, monitor)
+    return solve.run({**checked, "picked": None}, profile, monitor)
 
 
 @pytest.fixture(scope="module")
-def searched(scene: Scene, checked: dict[str, Any]) -> tuple[dict[str, Any], Memory]:
+def searched(scene: Scene, checked: dict[str, Any], memory: Any) -> Searched:
     """What a search of three trials finds, and what it kept."""
-    monitor = Memory({})
+    monitor = memory()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "MOST_TRIALS", 3)
         return solved(scene, checked, monitor), monitor
 
 
-def test_the_least_smp_that_is_acceptable_is_taken(
-    scene: Scene, checked: dict[str, Any], searched: tuple[dict[str, Any], Memory]
-) -> None:
+def test_the_least_smp_that_is_acceptable_is_taken(scene: Scene, checked: dict[str, Any], searched: Searched) -> None:
     trials = searched[0]["solve_report"]["least_smp"]
     acceptable = [trial for trial in trials if trial["acceptable"]]
     assert [trial["lam_SMP"] / trials[0]["lam_SMP"] for trial in trials[:2]] == [1, 2]
@@ -82,17 +68,17 @@ def test_the_least_smp_that_is_acceptable_is_taken(
     assert volumes @ rho / volumes.sum() == pytest.approx(best["smp_fraction"], abs=0.06)
 
 
-def test_what_is_not_acceptable_says_why(searched: tuple[dict[str, Any], Memory]) -> None:
+def test_what_is_not_acceptable_says_why(searched: Searched) -> None:
     for trial in searched[0]["solve_report"]["least_smp"]:
         assert trial["acceptable"] == (not trial["reasons"])
 
 
 def test_a_killed_search_goes_on_with_the_same_bits(
-    scene: Scene, checked: dict[str, Any], searched: tuple[dict[str, Any], Memory], monkeypatch: pytest.MonkeyPatch
+    scene: Scene, checked: dict[str, Any], memory: Any, searched: Searched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, monitor = searched
     assert {"trial-1", "trial-2"} <= set(monitor.saved)
-    killed = Memory({name: arrays for name, arrays in monitor.saved.items() if name != "trial-2"})
+    killed = memory({name: arrays for name, arrays in monitor.saved.items() if name != "trial-2"})
     prices = []
 
     def counted(problem: Any, settings: Any, start: Any, lam_SMP: float, watch: Any) -> Any:

@@ -13,12 +13,13 @@ from fab4d.runner.table import Stage, stage_table
 
 ROOM = Path(__file__).parents[2] / "fab4d" / "stages"
 HELPERS = {"monitor"}
-STAGES = pytest.mark.parametrize("stage", stage_table().stages, ids=lambda stage: stage.name)
+STAGES = pytest.mark.parametrize("stage", stage_table().stages + stage_table().studies, ids=lambda stage: stage.name)
 
 
 def test_the_table_names_the_modules_of_the_room() -> None:
     modules = {path.stem for path in ROOM.glob("*.py") if not path.stem.startswith("_")}
-    assert modules - HELPERS == set(stage_table().names)
+    studies = {study.name for study in stage_table().studies}
+    assert modules - HELPERS == {*stage_table().names, *studies}
 
 
 @STAGES

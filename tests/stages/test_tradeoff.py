@@ -1,0 +1,130 @@
+"""The study tradeoff on samples/strip: rows as printed, kept and gone on with, and picked by stage solve."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fab4d.errors import EquilibriumError, SceneError
+from fab4d.io.meshes import read_mesh
+from fab4d.io.scene import Scene, Weights, load_scene
+from fab4d.runner.table import stage_table
+from fab4d.stages import check, solve, threshold, tradeoff
+from fab4d.stages.monitor import SilentMonitor
+
+STRIP = Path(__file__).parents[2] / "samples" / "strip"
+STUDY = stage_table().study("tradeoff")
+Kept = tuple[list[dict[str, str]], Any]
+
+
+def profile_of(scene: Scene, stage: Any) -> dict[str, Any]:
+    return {name: getattr(scene, name) for name in stage.profile}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(STRIP)
+
+
+@pytest.fixture(scope="module")
+def checked(scene: Scene) -> dict[str, Any]:
+    files = {"permanent": read_mesh(scene.permanent), "temporary": read_mesh(scene.temporary)}
+    return check.run(files, profile_of(scene, stage_table().stage("check")), SilentMonitor())
+
+
+def study(scene: Scene, checked: dict[str, Any], monitor: Any, **options: Any) -> list[dict[str, str]]:
+    made = tradeoff.run(checked, profile_of(scene, STUDY), monitor, **options)
+    return list(csv.DictReader(io.StringIO(made["tradeoff_csv"].decode())))
+
+
+@pytest.fixture(scope="module")
+def kept(scene: Scene, checked: dict[str, Any], memory: Any) -> Kept:
+    """Two rows of three points, and what was kept of them."""
+    monitor = memory()
+    return study(scene, checked, monitor, points=[3], prices=[1.0, 4.0]), monitor
+
+
+def test_dearer_smp_gives_a_row_with_less_of_it(kept: Kept) -> None:
+    rows, _ = kept
+    assert [row["id"] for row in rows] == ["3x1", "3x4"]
+    share = [float(row["smp_fraction"]) for row in rows]
+    assert share[1] < 0.8 * share[0]
+    assert [float(row["lam_SMP"]) for row in rows] == pytest.approx([0.05, 0.2])
+    assert {row["points"] for row in rows} == {"3"}
+
+
+def test_mass_and_cost_are_those_of_the_share(scene: Scene, checked: dict[str, Any], kept: Kept) -> None:
+    mesh, card = checked["mesh"], scene.materials
+    edges = mesh["X"][mesh["tets"][:, 1:]] - mesh["X"][mesh["tets"][:, :1]]
+    cm3 = np.abs(np.linalg.det(edges)).sum() / 6000
+    for row in kept[0]:
+        smp, tpe = cm3 * float(row["smp_fraction"]), cm3 * (1 - float(row["smp_fraction"]))
+        mass = smp * card.smp_density, tpe * card.tpe_density
+        assert float(row["mass_g"]) == pytest.approx(sum(mass))
+        price = (mass[0] * card.smp_price + mass[1] * card.tpe_price) / 1000
+        assert float(row["cost_usd"]) == pytest.approx(price)
+
+
+def test_a_finished_row_is_not_made_again_and_a_lost_one_comes_out_equal(
+    scene: Scene, checked: dict[str, Any], memory: Any, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, whole = kept
+    killed = memory({name: arrays for name, arrays in whole.saved.items() if name != "3x4"})
+    killed.saved["index"] = {"names": np.array(["3x1"])}
+    prices, search_at = [], tradeoff.search_at
+
+    def counted(problem: Any, settings: Any, start: Any, lam_SMP: float, watch: Any) -> Any:
+        prices.append(lam_SMP)
+        return search_at(problem, settings, start, lam_SMP, watch)
+
+    monkeypatch.setattr(tradeoff, "search_at", counted)
+    again = study(scene, checked, killed, points=[3], prices=[1.0, 4.0])
+    assert prices == pytest.approx([0.2])
+    assert [row | {"tau": ""} for row in again] == [row | {"tau": ""} for row in rows]
+    for name in ("rho", "x", "y", "forces"):
+        np.testing.assert_array_equal(killed.saved["3x4"][name], whole.saved["3x4"][name])
+    assert study(scene, checked, killed, points=[3], prices=[4.0]) == again
+
+
+def test_stage_solve_takes_a_picked_row_as_it_is(scene: Scene, checked: dict[str, Any], kept: Kept) -> None:
+    """Thresholding what solve makes of the pick gives the design that the row was judged by, before its flips."""
+    arrays = kept[1].saved["3x4"]
+    made = solve.run({**checked, "picked": arrays}, profile_of(scene, stage_table().stage("solve")), SilentMonitor())
+    np.testing.assert_array_equal(made["relaxed"]["rho"], arrays["rho"])
+    assert made["solve_report"]["picked"]["id"] == "3x4"
+    assert made["solve_report"]["picked"] == json.loads(str(arrays["row"]))
+    assert len(made["relaxed"]["patch_center"]) == 3
+    assert [line.split(b",")[1] for line in made["solve_trace"].splitlines()[1:]] == [b"picked"]
+    labels = threshold.labels_for(checked["mesh"]["X"], checked["mesh"]["tets"], arrays["rho"], scene.printer)
+    assert labels.smp.any()
+
+
+def test_numbers_of_points_without_a_design_are_told(scene: Scene, checked: dict[str, Any], memory: Any) -> None:
+    free = {**checked, "mesh": {**checked["mesh"], "clamp": np.zeros(len(checked["mesh"]["X"]), bool)}}
+    with pytest.raises(EquilibriumError, match=r"2 points: .*needs 3 points"):
+        study(scene, free, memory(), points=[2])
+
+
+@pytest.mark.parametrize("weights", [Weights(lam_SMP=0.0), Weights(lam_force=1.0)])
+def test_weights_that_leave_nothing_to_multiply_are_refused(
+    scene: Scene, checked: dict[str, Any], memory: Any, weights: Weights
+) -> None:
+    with pytest.raises(SceneError, match="lam_SMP, which must be above 0"):
+        study(replace(scene, weights=weights), checked, memory())
+
+
+def test_nothing_to_program_is_nothing_to_trade(scene: Scene, checked: dict[str, Any], memory: Any) -> None:
+    still = {**checked, "check_report": {**checked["check_report"], "nothing_to_program": True}}
+    with pytest.raises(SceneError, match="nothing to trade"):
+        study(scene, still, memory())
+
+
+def test_usual_points_are_half_to_all() -> None:
+    assert tradeoff.usual_points(8) == [4, 6, 8]
+    assert tradeoff.usual_points(3) == [2, 3]
+    assert tradeoff.usual_points(1) == [1]
