@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from fab4d.fabrication.bodies import Bodies, as_manifold
 from fab4d.fabrication.features import thin_places
 from fab4d.fabrication.labels import clusters_of
+from fab4d.fabrication.layers import unfilled
 from fab4d.fabrication.wellcomposed import pinched_vertices
 from fab4d.mesh.measures import face_area_vectors, tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
@@ -22,6 +23,10 @@ from fab4d.mesh.topology import component_labels, face_table
 _NO_LIMIT = 1e-3
 MAX_THIN_SHARE = 1e-3
 """Share of the volume that sharp edges may have in walls that are too thin."""
+MAX_EMPTY_SHARE = 0.03
+"""Share of a body that lines may leave empty: as much as a slice may differ from its body."""
+MARGIN = 0.2
+"""A figure this near to its limit, as a share of it, is worth a look although it holds."""
 MAX_SLENDERNESS = 10.0
 """Height over the root of the first layer's area: above, the nozzle knocks a part over."""
 MAX_PURGE_SHARE = 1.0
@@ -52,6 +57,14 @@ class PrintCheck:
     unit: str
     where: tuple[float, float, float] | None = None
 
+    @property
+    def marginal(self) -> bool:
+        """Whether it holds by little only."""
+        if not self.ok or self.limit == 0:
+            return False
+        gap = self.value - self.limit if self.sense == "at least" else self.limit - self.value
+        return gap < MARGIN * abs(self.limit) and not float(self.value).is_integer()
+
 
 def print_checks(
     X: FloatArray, tets: IntArray, smp: BoolArray, bodies: Bodies, limits: PrintLimits
@@ -62,6 +75,7 @@ def print_checks(
     """
     return [
         *_thin(X, tets, smp, limits),
+        *_unfilled(bodies, limits),
         *_clusters(X, tets, smp, limits),
         _pieces(tets),
         _held_by_an_edge(X, tets, smp),
@@ -101,6 +115,22 @@ def _thin_share(name: str, X: FloatArray, tets: IntArray, thin: BoolArray) -> Pr
     share = float(volumes[thin].sum() / volumes.sum())
     where = _middle(X, tets[[np.argmax(np.where(thin, volumes, 0.0))]]) if thin.any() else None
     return PrintCheck(name, share <= MAX_THIN_SHARE, share, "at most", MAX_THIN_SHARE, "of the volume", where)
+
+
+def _unfilled(bodies: Bodies, limits: PrintLimits) -> list[PrintCheck]:
+    """Sharp corners and walls of each body that are narrower than a line."""
+    return [
+        PrintCheck(
+            f"{name.upper()} that lines leave empty",
+            found.share <= MAX_EMPTY_SHARE,
+            found.share,
+            "at most",
+            MAX_EMPTY_SHARE,
+            "of its volume",
+            found.where,
+        )
+        for name, found in unfilled(bodies, limits.line_width, limits.layer_height).items()
+    ]
 
 
 def _clusters(X: FloatArray, tets: IntArray, smp: BoolArray, limits: PrintLimits) -> list[PrintCheck]:
@@ -151,12 +181,13 @@ def _first_layer(bodies: Bodies, limits: PrintLimits) -> list[PrintCheck]:
     section = as_manifold(whole).slice(low + 0.5 * limits.layer_height)
     area = section.area()
     slenderness = float((high - low) / np.sqrt(area)) if area > 0 else float("inf")
-    checks = [_at_most("height over the root of the first layer's area", slenderness, MAX_SLENDERNESS, "")]
+    x, y, z = _centre_of_mass(whole.vertices, whole.faces).tolist()
+    name, foot = "height over the root of the first layer's area", (x, y, float(low))
+    checks = [_at_most(name, slenderness, MAX_SLENDERNESS, "", foot)]
     if area > 0:
-        margin = _inside_hull(section, _centre_of_mass(whole.vertices, whole.faces)[:2])
-        checks.append(
-            PrintCheck("centre of mass inside the first layer's hull", margin >= 0, margin, "at least", 0.0, "mm")
-        )
+        margin = _inside_hull(section, np.array([x, y]))
+        name = "centre of mass inside the first layer's hull"
+        checks.append(PrintCheck(name, margin >= 0, margin, "at least", 0.0, "mm", (x, y, z)))
     return checks
 
 
@@ -188,8 +219,10 @@ def _purge(X: FloatArray, tets: IntArray, smp: BoolArray, limits: PrintLimits) -
     return _at_most("purge of the tool changes", share, MAX_PURGE_SHARE, "of the volume")
 
 
-def _at_most(name: str, value: float, limit: float, unit: str) -> PrintCheck:
-    return PrintCheck(name, value <= limit, value, "at most", limit, unit)
+def _at_most(
+    name: str, value: float, limit: float, unit: str, where: tuple[float, float, float] | None = None
+) -> PrintCheck:
+    return PrintCheck(name, value <= limit, value, "at most", limit, unit, where)
 
 
 def _middle(X: FloatArray, tets: IntArray) -> tuple[float, float, float]:

@@ -21,11 +21,17 @@ ASSETS = files("fab4d.report") / "assets"
 
 
 def report_page(
-    name: str, report: Mapping[str, Any], checks: Sequence[Check], scene: Mapping[str, Any], plot: bytes | None
+    name: str,
+    report: Mapping[str, Any],
+    checks: Sequence[Check],
+    scene: Mapping[str, Any],
+    plot: bytes | None,
+    places: bytes | None = None,
 ) -> bytes:
     """The page of part `name`.
 
     report : report.json      scene : from `view_data`      plot : PNG of error against run time, None without a solver
+    places : PNG of where the part may not print well, None where there is nothing to show
     """
     text = Template(_asset("page.html")).substitute(
         title=escape(name),
@@ -35,7 +41,8 @@ def report_page(
         reasons=_bullets(report["reasons"]) if report["verdict"] != ACCEPTED else "",
         figures=_figures(report),
         checks=_checks(checks),
-        plot=_image(plot),
+        places=_image(places, "places of the checks of printing", ""),
+        plot=_image(plot, "error against run time", "<p>Nothing was solved.</p>"),
         forces=_forces(scene["points"]),
         careful=_careful(report["sensitivity"]),
         stages=_stages(report),
@@ -222,7 +229,7 @@ def _bullets(lines: Iterable[str]) -> str:
     return f"<ul>{items}</ul>" if items else "<p>Nothing.</p>"
 
 
-def _image(png: bytes | None) -> str:
+def _image(png: bytes | None, words: str, without: str) -> str:
     if png is None:
-        return "<p>Nothing was solved.</p>"
-    return f'<img alt="error against run time" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+        return without
+    return f'<img alt="{words}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

@@ -55,6 +55,7 @@ _FILES = {
     "tpe_stl": "TPE body",
     "part_3mf": "both bodies for PrusaSlicer",
     "part_orca_3mf": "both for OrcaSlicer, Bambu Studio, Cura",
+    "print_places": "where it may not print well",
     "design_vtu": "the verified state",
     "error_vs_time": "error against run time",
     "report_json": "all figures",

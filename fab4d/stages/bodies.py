@@ -25,6 +25,8 @@ from fab4d.io.stl import stl_arrays, stl_bytes
 from fab4d.io.threemf import Part, components_3mf, prusa_3mf
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+from fab4d.report.places import Place, places_picture
+from fab4d.report.verdict import print_checks_of
 from fab4d.rig.schedule import BATH_MARGIN
 from fab4d.stages.monitor import Monitor
 
@@ -65,7 +67,7 @@ def print_files(
     # In a 3MF file the last part wins where two overlap.
     parts = [_part(body) for body in reversed(bodies.printed)]
     found = print_checks(X, tets, smp, bodies, _print_limits(printer))
-    checks = [*(_in_part_frame(check, axes) for check in found), *_bath_check(materials)]
+    plain = [_plain(_in_part_frame(check, axes)) for check in found]
     title = f"{name} (REJECTED)" if rejected else name
     says = "; ".join(["REJECTED", *rejected]) if rejected else ""
     bottom = float(bodies.whole.vertices[:, 2].min())
@@ -75,17 +77,28 @@ def print_files(
         "tpe_stl": files.get("tpe"),
         "part_3mf": prusa_3mf(title, parts, -bottom, says),
         "part_orca_3mf": components_3mf(title, parts, -bottom, says),
+        "print_places": places_picture(X, tets, smp, _places(found, plain)),
         "bodies_report": _report(bodies, _cluster_count(tets, smp), printer, materials)
-        | {"checks": [_plain(check) for check in checks]}
+        | {"checks": [*plain, *(_plain(check) for check in _bath_check(materials))]}
         | {"purge": {"tool_changes": changes, "volume_mm3": changes * printer.purge_per_change}}
         | {"printer": asdict(printer), "printer_axes": axes.tolist()},
     }
 
 
+def _places(found: Sequence[PrintCheck], plain: Sequence[Mapping[str, Any]]) -> list[Place]:
+    """The places of checks that fail, then of those that hold by little only, in the printer's frame."""
+    told = [
+        Place(check.where, ("" if not check.ok else "holds barely: ") + reason.reason, not check.ok)
+        for check, reason in zip(found, print_checks_of({"checks": plain}), strict=True)
+        if check.where is not None and (check.marginal or not check.ok)
+    ]
+    return sorted(told, key=lambda place: not place.failed)
+
+
 def _in_part_frame(check: PrintCheck, axes: FloatArray) -> PrintCheck:
     if check.where is None:
         return check
-    x, y, z = (np.array(check.where) @ axes + 0.0).tolist()
+    x, y, z = (np.round(np.array(check.where) @ axes, 3) + 0.0).tolist()
     return replace(check, where=(x, y, z))
 
 

@@ -57,7 +57,12 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "error_plot": plot,
         "design_vtu": _design_vtu(inputs, smp),
         "report_html": report_page(
-            profile["name"], report, [*checks, *print_checks_of(report["printing"])], view, plot
+            profile["name"],
+            report,
+            [*checks, *print_checks_of(report["printing"])],
+            view,
+            plot,
+            inputs["print_places"],
         ),
     }
 

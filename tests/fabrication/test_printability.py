@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fab4d.fabrication.bodies import bodies_from_labels
-from fab4d.fabrication.printability import PrintLimits, print_checks, tool_changes
+from fab4d.fabrication.printability import PrintCheck, PrintLimits, print_checks, tool_changes
 
 LIMITS = PrintLimits((300.0, 200.0, 100.0), nozzle=0.4, line_width=0.42, layer_height=0.2, purge_per_change=100.0)
 
@@ -116,3 +116,28 @@ def test_tools_change_in_layers_with_both_materials(block, axis, at, changes):
     X, tets, _ = block
     assert tool_changes(X, tets, halves(X, tets, axis, at), 0.2) == changes
     assert tool_changes(X + 7.3, tets, halves(X, tets, axis, at), 0.2) == changes
+
+
+def test_what_lines_leave_empty_is_told_for_each_body(meshes):
+    X, tets = meshes["box"]((10, 10, 4), 0.3)
+    found = checks(X, tets, halves(X, tets, 0, 0.3))
+    assert found["SMP that lines leave empty"].value == pytest.approx(1)
+    assert not found["SMP that lines leave empty"].ok
+    assert found["SMP that lines leave empty"].where[0] == pytest.approx(0.15, abs=0.01)
+    assert found["TPE that lines leave empty"].ok
+
+
+@pytest.mark.parametrize(
+    ("value", "sense", "limit", "ok", "marginal"),
+    [
+        (0.9, "at most", 1.0, True, True),
+        (0.7, "at most", 1.0, True, False),
+        (1.1, "at most", 1.0, False, False),
+        (1.1, "at least", 1.0, True, True),
+        (1.3, "at least", 1.0, True, False),
+        (1, "at most", 1, True, False),
+        (3.0, "at least", 0.0, True, False),
+    ],
+)
+def test_what_holds_barely(value, sense, limit, ok, marginal):
+    assert PrintCheck("x", ok, value, sense, limit, "mm").marginal == marginal

@@ -115,6 +115,7 @@ def inputs(bar: ModuleType) -> dict[str, Any]:
         "sensitivity_report": sensitivity_report(),
         "bodies_report": None,
         "slice_report": None,
+        "print_places": None,
         "rig_report": {"points": 3, "reasons": [], "left_out": []},
         "run": {
             "stages": [

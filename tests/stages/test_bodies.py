@@ -129,3 +129,13 @@ def test_files_of_a_rejected_design_say_so(mesh):
         assert '<metadata name="Title">box (REJECTED)</metadata>' in model
         assert "REJECTED; RMS error is &lt;9&gt; mm; too many forces" in model
         assert "REJECTED" not in zipfile.ZipFile(io.BytesIO(good[name])).read("3D/3dmodel.model").decode()
+
+
+def test_places_that_may_not_print_well_are_drawn(mesh):
+    assert run(mesh, left(mesh))["print_places"] is None
+    smp = np.zeros(len(mesh["tets"]), bool)
+    smp[:6] = True
+    small = {"X": mesh["X"] / 10, "tets": mesh["tets"]}
+    out = run(small, smp)
+    assert any(check["where"] and not check["ok"] for check in out["bodies_report"]["checks"])
+    assert out["print_places"].startswith(b"\x89PNG")
