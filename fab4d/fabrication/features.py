@@ -6,7 +6,7 @@ ellipsoids that fit into its own material (a morphological opening, by vote of t
 
 import numpy as np
 
-from fab4d.fabrication._thickness_kernels import RADIUS, Solid, covered_points
+from fab4d.fabrication._thickness_kernels import ENOUGH, RADIUS, Solid, covered_points
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import TET_FACES, face_table
@@ -76,6 +76,9 @@ def _mostly_covered(
     X: FloatArray, tets: IntArray, neighbours: IntArray, points: FloatArray, tested: BoolArray, inside: BoolArray
 ) -> BoolArray:
     m = len(tets)
+    # Where no ball fits anyhow, each one would be searched through the whole part.
+    if not inside.any() or np.ptp(X[tets[inside]], axis=(0, 1)).min() < 2 * ENOUGH:
+        return np.zeros(m, bool)
     solid = Solid(X, tets, neighbours, inside, np.zeros(m + 1, np.int64), np.zeros(m, np.int64))
     return covered_points(points, tested, solid).mean(axis=1) >= 0.5
 

@@ -37,6 +37,8 @@ class PrinterCard:
     """Diameter of both nozzles."""
     purge_per_change: float = 140.0
     """Purged at a change of tool, mm^3. Source: the default of PrusaSlicer, 70 unloading and 70 loading."""
+    tool_change_time: float | None = None
+    """Of one change of tool, s; None where the card does not tell."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction of the permanent shape that points up while printing, unit vector; from the scene, not the card."""
 
@@ -84,6 +86,7 @@ _PRINTER = {
     "filament_diameter_mm": Key(positive, required=True),
     "nozzle_mm": Key(positive),
     "purge_per_change_mm3": Key(non_negative),
+    "tool_change_time_s": Key(non_negative),
 }
 _RIG = {
     "name": Key(text, required=True),
@@ -160,4 +163,7 @@ def _moduli(table: Mapping[str, Any]) -> Moduli:
 
 def _without_units(table: Mapping[str, Any]) -> dict[str, Any]:
     """The keys without the unit that they end in: volume_mm is the field volume."""
-    return {key.removesuffix("_mm").removesuffix("_mm3").removesuffix("_N"): value for key, value in table.items()}
+    return {
+        key.removesuffix("_mm").removesuffix("_mm3").removesuffix("_N").removesuffix("_s"): value
+        for key, value in table.items()
+    }

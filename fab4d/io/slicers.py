@@ -27,6 +27,8 @@ _CURA_PROGRAMS = ("CuraEngine", "curaengine")
 # CuraEngine's own variable for the folders of definitions.
 _CURA_PATH = "CURA_ENGINE_SEARCH_PATH"
 _CURA_DEFINITIONS = ("/usr/share/cura/resources/definitions", "/usr/local/share/cura/resources/definitions")
+# Of Cura's definition of a printer in general.
+_CURA_SPEEDS = {"speed_wall_0": 30.0, "speed_wall_x": 60.0, "speed_infill": 60.0, "speed_topbottom": 30.0}
 _DURATION = re.compile(r"(\d+)([dhms])")
 _SECONDS = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 _TIME_FORMS = re.compile(
@@ -53,7 +55,10 @@ class PrintFiles:
 
 @dataclass(frozen=True)
 class Slice:
-    """Filament (mm) of each extruder in turn, and the print time that the slicer expects (s; None: it tells none)."""
+    """Filament (mm) of each extruder in turn, and the print time that the slicer expects (s; None: it tells none).
+
+    Neither slicer counts the changes of tool.
+    """
 
     filament_mm: tuple[float, ...]
     print_time_s: float | None
@@ -81,7 +86,7 @@ def find_slicer(kind: str | None = None) -> Slicer:
 def slice_bodies(slicer: Slicer, files: PrintFiles, printer: PrinterCard, flows: Iterable[float]) -> Slice:
     """Slice the bodies solid, without tower, skirt or supports, so that filament and volume can be compared.
 
-    flows : fastest extrusion of each extruder, mm^3/s; 0 is not limited (only PrusaSlicer knows of it)
+    flows : fastest extrusion of each extruder, mm^3/s; 0 is not limited
 
     Raises SliceError when the slicer fails or writes no G-code.
     """
@@ -90,7 +95,7 @@ def slice_bodies(slicer: Slicer, files: PrintFiles, printer: PrinterCard, flows:
         if slicer.kind == "prusa":
             command = _prusa_command(slicer, files, printer, flows, folder)
         else:
-            command = _cura_command(slicer, files, printer, folder)
+            command = _cura_command(slicer, files, printer, flows, folder)
         said = _run(command, slicer, folder)
         return _slice_of(folder / "part.gcode", slicer, said)
 
@@ -206,6 +211,12 @@ def cura_settings(printer: PrinterCard) -> dict[str, str]:
     }
 
 
+def cura_speeds(printer: PrinterCard, flow: float) -> dict[str, str]:
+    """Speeds (mm/s) of a tool that extrudes at most `flow` (mm^3/s; 0: no limit), which CuraEngine knows nothing of."""
+    fastest = flow / (printer.line_width * printer.layer_height) if flow > 0 else math.inf
+    return {name: f"{min(speed, fastest):g}" for name, speed in _CURA_SPEEDS.items()}
+
+
 def _cura_machine(printer: PrinterCard) -> dict[str, str]:
     width, depth, height = (f"{side:g}" for side in printer.volume)
     return cura_settings(printer) | {
@@ -232,14 +243,16 @@ def _prusa_command(
     return [str(slicer.program), *options]
 
 
-def _cura_command(slicer: Slicer, files: PrintFiles, printer: PrinterCard, folder: Path) -> list[str]:
+def _cura_command(
+    slicer: Slicer, files: PrintFiles, printer: PrinterCard, flows: Iterable[float], folder: Path
+) -> list[str]:
     if slicer.definitions is None:
         msg = f"{slicer.program}: {_CURA_PATH} names no folder with fdmprinter.def.json"
         raise MissingToolError(msg)
     command = [str(slicer.program), "slice", "-v", "-j", str(slicer.definitions / "fdmprinter.def.json")]
     command += [*_as_options(_cura_machine(printer)), "-o", "part.gcode"]
-    for tool in range(TOOLS):
-        settings = _as_options(cura_settings(printer) | {"extruder_nr": str(tool)})
+    for tool, flow in enumerate(flows):
+        settings = _as_options(cura_settings(printer) | cura_speeds(printer, flow) | {"extruder_nr": str(tool)})
         command += [f"-e{tool}", "-j", str(slicer.definitions / "fdmextruder.def.json"), *settings]
     place = _as_options(_on_the_bed(files, printer))
     for extruder, stl in sorted(files.stls.items()):

@@ -139,9 +139,18 @@ def _figures(report: Mapping[str, Any]) -> str:
         "residual, median / final": f"{_power(residual['median'])} / {_power(residual['final'])}",
         "mass": f"{plain(report['mass_g'])} g",
         "material": f"{plain(report['cost_usd'])} USD",
+        **_print_time(report["printing"]),
         "run time": f"{plain(report['wall_s'])} s",
     }
     return "".join(f"<div><span>{escape(k)}</span><strong>{escape(v)}</strong></div>" for k, v in shown.items())
+
+
+def _print_time(printing: Mapping[str, Any]) -> dict[str, str]:
+    """The slicer's, with what it leaves out; nothing where nothing was sliced."""
+    seconds = printing["print_time_s"]
+    if seconds is None:
+        return {}
+    return {f"print time, without {' and '.join(printing['print_time_without'])}": f"{plain(seconds / 3600)} h"}
 
 
 def _or_dash(value: float | None) -> str:

@@ -101,7 +101,8 @@ def slice_lines(report: Mapping[str, Any]) -> list[str]:
             f"{body['volume_mm3'] / 1000:.4g} cm^3, {body['filament_m']:.3g} m of filament"
         )
     if report["print_time_s"] is not None:
-        lines.append(f"  print time, without changes of tool: {duration(report['print_time_s'])}")
+        without = " and ".join(report["print_time_without"])
+        lines.append(f"  print time, without {without}: {duration(report['print_time_s'])}")
     return [*lines, *warning_lines(report)]
 
 

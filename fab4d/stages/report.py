@@ -80,6 +80,7 @@ def _printing(reports: Mapping[str, Any]) -> dict[str, Any]:
         "filament_m": {name: body.get("filament_m") for name, body in bodies.get("bodies", {}).items()},
         "purge": bodies.get("purge"),
         "print_time_s": sliced.get("print_time_s"),
+        "print_time_without": sliced.get("print_time_without", []),
         "checks": [*bodies.get("checks", []), *sliced.get("checks", [])],
     }
 

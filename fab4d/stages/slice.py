@@ -47,10 +47,19 @@ def slice_report(slicer: Slicer, inputs: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "slicer": slicer.program.name,
         "bodies": figures,
-        "print_time_s": found.print_time_s,
+        **_print_time(found, printer, inputs["bodies_report"]["purge"]["tool_changes"]),
         "checks": [_check(name, figures[name]) for name in EXTRUDERS],
         "left_out": [],
     }
+
+
+def _print_time(found: Slice, printer: PrinterCard, tool_changes: int) -> dict[str, Any]:
+    """The slicer's time with what the card says of changes of tool, and in words what it leaves out."""
+    seconds, change = found.print_time_s, printer.tool_change_time
+    if seconds is None:
+        return {"print_time_s": None, "print_time_without": []}
+    without = ["heating"] if change is not None else ["heating", f"{tool_changes} changes of tool"]
+    return {"print_time_s": seconds + tool_changes * (change or 0.0), "print_time_without": without}
 
 
 def _printer(table: Mapping[str, Any]) -> PrinterCard:

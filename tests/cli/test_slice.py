@@ -78,7 +78,7 @@ def test_a_good_slice_ends_with_0_and_a_report(mesh: Path, monkeypatch: pytest.M
     result = fab4d("slice", "runs/bar-bodies")
     assert result.exit_code == 0, result.output
     assert "SMP: tool 1, 2.01 cm^3 laid down for a body of 2 cm^3" in result.stdout
-    assert "print time, without changes of tool: 1 h 30 min" in result.stdout
+    assert "print time, without heating and 50 changes of tool: 1 h 30 min" in result.stdout
     assert json.loads(Path("runs/bar-bodies/work/slice.json").read_text())["slicer"] == "some-slicer"
 
 

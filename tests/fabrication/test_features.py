@@ -1,10 +1,12 @@
 """Walls and layers thinner than the feature go, thicker ones stay, and coarse meshes are left alone."""
 
+from time import process_time
+
 import numpy as np
 import pytest
 
 from fab4d.fabrication._thickness_kernels import nearest_on_triangle
-from fab4d.fabrication.features import tet_neighbours, without_thin_places
+from fab4d.fabrication.features import tet_neighbours, thin_places, without_thin_places
 from fab4d.mesh.topology import face_table
 
 FEATURE = 0.8, 0.4
@@ -95,3 +97,13 @@ def test_neighbours_lie_across_the_opposite_face(meshes):
     for tet, corner in np.argwhere(neighbours >= 0):
         shared = set(tets[tet]) & set(tets[neighbours[tet, corner]])
         assert shared == set(np.delete(tets[tet], corner))
+
+
+def test_a_part_below_the_feature_is_left_alone_at_once(meshes):
+    """As when metres were taken for mm: a search for balls would take hours."""
+    X, tets = meshes["box"]((20, 20, 20), size=1e-3)
+    smp = X[tets].mean(axis=1)[:, 0] < 0.01
+    start = process_time()
+    assert np.array_equal(without_thin_places(X, tets, smp, *FEATURE), smp)
+    assert thin_places(X, tets, smp, *FEATURE).all()
+    assert process_time() - start < 10

@@ -12,6 +12,7 @@ from fab4d.io.cards import card_names, load_printer
 from fab4d.io.slicers import (
     PrintFiles,
     Slicer,
+    cura_speeds,
     filament_length,
     filament_lengths,
     filament_volume,
@@ -151,6 +152,18 @@ def test_profiles_are_of_the_card(name):
     assert 0.8 * printer.nozzle < printer.line_width < 1.5 * printer.nozzle
     assert printer.layer_height <= 0.8 * printer.nozzle
     assert len(printer.source) > 40
+
+
+def test_cura_keeps_to_the_flow_of_the_filament():
+    assert set(cura_speeds(PRINTER, 1.2).values()) == {f"{1.2 / (0.42 * 0.2):g}"}
+    assert cura_speeds(PRINTER, 0.0)["speed_infill"] == cura_speeds(PRINTER, 100.0)["speed_infill"] == "60"
+
+
+@pytest.mark.skipif("cura" not in {s.kind for s in installed_slicers()}, reason="CuraEngine is not installed")
+def test_a_slower_flow_takes_longer_with_cura():
+    fast, slow = (slice_bodies(find_slicer("cura"), files(TPE), PRINTER, (0, flow)).print_time_s for flow in (0, 1.2))
+    assert slow > 2 * fast
+    assert slow > 2400 / 1.2
 
 
 def test_filament_length_and_volume():

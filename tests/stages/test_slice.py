@@ -69,7 +69,7 @@ def test_samples_are_laid_down_in_stripes_too(slicer, sample):
 def lay_down(monkeypatch, *volumes):
     lengths = tuple(filament_length(volume, PRINTER) for volume in volumes)
     monkeypatch.setattr(slicing, "find_slicer", lambda: FAKE)
-    monkeypatch.setattr(slicing, "slice_bodies", lambda *_: Slice(lengths, None))
+    monkeypatch.setattr(slicing, "slice_bodies", lambda *_: Slice(lengths, 600.0))
 
 
 @pytest.mark.parametrize(
@@ -104,3 +104,14 @@ def test_a_slicer_that_fails_is_told(files, monkeypatch):
     (check,) = run(files)["checks"]
     assert not check["ok"]
     assert "exit code 1" in check["message"]
+
+
+@pytest.mark.parametrize(("change", "seconds", "without"), [(None, 600, 2), (10.0, 1600, 1)])
+def test_changes_of_tool_take_the_time_of_the_card(files, monkeypatch, change, seconds, without):
+    lay_down(monkeypatch, 5000, 10000)
+    bodies_report = files["bodies_report"]
+    assert bodies_report["purge"]["tool_changes"] == 100
+    printer = bodies_report["printer"] | {"tool_change_time": change}
+    report = run(files | {"bodies_report": bodies_report | {"printer": printer}})
+    assert report["print_time_s"] == seconds
+    assert len(report["print_time_without"]) == without
