@@ -169,6 +169,14 @@ def _clusters(pairs: IntArray, labels: BoolArray) -> IntArray:
     return component_labels(len(labels), pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]])
 
 
+def enclosed(tets: IntArray, labels: BoolArray) -> BoolArray:
+    """Tets (m,) of clusters that nowhere reach the surface of the part: pockets of one material in the other."""
+    faces = face_table(tets)
+    cluster = _clusters(faces.interior_tets, labels)
+    open_ones = np.unique(cluster[faces.boundary_tets])
+    return ~np.isin(cluster, open_ones)
+
+
 def smp_clusters(tets: IntArray, volumes: FloatArray, smp: BoolArray) -> IntArray:
     """0 for TPE, 1.. for the face-connected clusters of SMP by falling volume (equal ones by their first tet), (m,)."""
     cluster = clusters_of(tets, smp)

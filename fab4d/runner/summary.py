@@ -47,6 +47,12 @@ _FIGURES: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "wall_s": ("time", duration),
     "peak_rss_mb": ("memory", lambda value: f"{value:.0f} MB"),
 }
+_STEPS = {
+    "clusters": "small clusters",
+    "features": "thin places",
+    "well_composed": "edges and points that would not hold",
+    "larger_features": "corners that lines leave empty",
+}
 _FILES = {
     "report_html": "read this first",
     "rig_sheet": "take this to the rig",
@@ -87,9 +93,19 @@ def body_lines(report: Mapping[str, Any]) -> list[str]:
         f"{body['filament_m']:.3g} m of filament, {body['cost_usd']:.2f} USD"
         for name, body in report["bodies"].items()
     ]
+    lines += [
+        f"  {name.upper()} enclosed in the other material: {pocket['count']} places, {pocket['volume_mm3']:.3g} mm^3"
+        for name, pocket in report["pockets"].items()
+        if pocket["count"]
+    ]
     purge = report["purge"]
+    if "labels" in report:
+        changed = report["labels"]["changed_fraction"]
+        steps = [f"{words} {100 * changed[step]:.2g} %" for step, words in _STEPS.items() if changed[step] > 0]
+        total = f"  labels changed to print: {100 * changed['total']:.2g} % of the volume"
+        lines.append("; ".join([total, *steps]))
     lines.append(f"  purge: {purge['tool_changes']} changes of tool, about {purge['volume_mm3'] / 1000:.3g} cm^3")
-    return [*lines, *warning_lines(report)]
+    return [*finding_lines(report.get("findings", [])), *lines, *warning_lines(report)]
 
 
 def slice_lines(report: Mapping[str, Any]) -> list[str]:

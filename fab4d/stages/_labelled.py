@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.errors import MeshError
+from fab4d.errors import BodyError, MeshError
 from fab4d.fabrication.labels import LabelResult, printable_labels
 from fab4d.fabrication.orientation import standing
 from fab4d.io.cards import PrinterCard
@@ -16,6 +16,9 @@ from fab4d.mesh.findings import Finding
 from fab4d.mesh.tetmesh import BoolArray
 from fab4d.stages.bodies import print_files
 from fab4d.stages.threshold import lines_of
+
+OUTSIZE = 10.0
+"""Longest side over that of the printer's volume from which the unit must be wrong."""
 
 
 def labelled_bodies(
@@ -28,14 +31,35 @@ def labelled_bodies(
     The report tells what the mesh doctor found and how much volume each step of the repair changed.
     Raises MeshError for an unusable mesh, BodyError for bodies that are no solids.
     """
+    _require_usable(raw, mm, printer)
     pair, findings = _cleaned(raw, mm)
-    result = printable_labels(standing(pair.X, printer.up), pair.tets, smp[pair.tet_map], lines_of(printer))
-    files = print_files(pair.X, pair.tets, result.smp, name, printer, materials)
+    try:
+        result = printable_labels(standing(pair.X, printer.up), pair.tets, smp[pair.tet_map], lines_of(printer))
+        files = print_files(pair.X, pair.tets, result.smp, name, printer, materials)
+    except BodyError as error:
+        msg = f"{raw.file}: {error}"
+        raise BodyError(msg) from error
     files["bodies_report"] |= {
         "labels": _label_figures(result),
         "findings": [asdict(found) | {"indices": list(found.indices)} for found in findings],
     }
     return files
+
+
+def _require_usable(raw: RawMesh, mm: float, printer: PrinterCard) -> None:
+    """Raise MeshError for coordinates that are no numbers, or of a size that tells of another unit."""
+    used = np.unique(raw.tets)
+    wrong = used[~np.isfinite(raw.points[used]).all(axis=1)]
+    if len(wrong):
+        msg = f"{raw.file}: vertex {wrong[0]} is at {raw.points[wrong[0]].tolist()}: export the mesh again"
+        raise MeshError(msg)
+    sides = mm * np.ptp(raw.points[used], axis=0)
+    small, large = sides.max() < printer.line_width, sides.max() > OUTSIZE * max(printer.volume)
+    if small or large:
+        found = " x ".join(f"{side:.3g}" for side in sides)
+        than = f"narrower than a line of {printer.line_width:g} mm" if small else "far beyond the printer's volume"
+        msg = f"{raw.file}: the part would be {found} mm, {than}: give the unit of the mesh with --units"
+        raise MeshError(msg)
 
 
 def _cleaned(raw: RawMesh, mm: float) -> tuple[Pair, list[Finding]]:

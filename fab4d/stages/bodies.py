@@ -16,7 +16,7 @@ from fab4d.fabrication.bodies import (
     require_solid,
     shells,
 )
-from fab4d.fabrication.labels import clusters_of
+from fab4d.fabrication.labels import clusters_of, enclosed
 from fab4d.fabrication.orientation import printer_axes, standing
 from fab4d.fabrication.printability import PrintCheck, PrintLimits, print_checks, tool_changes
 from fab4d.io.cards import PrinterCard
@@ -24,6 +24,7 @@ from fab4d.io.slicers import filament_length
 from fab4d.io.stl import stl_arrays, stl_bytes
 from fab4d.io.threemf import Part, components_3mf, prusa_3mf
 from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.report.places import Place, places_picture
 from fab4d.report.verdict import print_checks_of
@@ -81,6 +82,7 @@ def print_files(
         "bodies_report": _report(bodies, _cluster_count(tets, smp), printer, materials)
         | {"checks": [*plain, *(_plain(check) for check in _bath_check(materials))]}
         | {"purge": {"tool_changes": changes, "volume_mm3": changes * printer.purge_per_change}}
+        | {"pockets": {"smp": _pockets(X, tets, smp, smp), "tpe": _pockets(X, tets, smp, ~smp)}}
         | {"printer": asdict(printer), "printer_axes": axes.tolist()},
     }
 
@@ -123,6 +125,13 @@ def _bath_check(materials: MaterialCard) -> list[PrintCheck]:
 
 def _cluster_count(tets: IntArray, smp: BoolArray) -> int:
     return len(np.unique(clusters_of(tets, smp)[smp]))
+
+
+def _pockets(X: FloatArray, tets: IntArray, smp: BoolArray, material: BoolArray) -> dict[str, Any]:
+    """Clusters of the tets `material` (m,) that are enclosed in the other one."""
+    inside = enclosed(tets, smp) & material
+    count = len(np.unique(clusters_of(tets, smp)[inside]))
+    return {"count": count, "volume_mm3": float(tet_volumes(X, tets)[inside].sum())}
 
 
 def _plain(check: PrintCheck) -> dict[str, Any]:

@@ -62,6 +62,7 @@ def test_warnings_are_printed(mesh: Path) -> None:
         (("--labels", "smp"), 4, 'no cell field "smp"; it has: material'),
         (("--labels", "material", "--units", "ft"), 3, 'unknown length unit "ft"'),
         (("--labels", "material", "--printer", "prusa-x"), 3, 'did you mean "prusa-xl"'),
+        (("--labels", "material", "--up", "1,0"), USAGE_EXIT_CODE, "--up takes three numbers with commas"),
         (("--printer", "prusa-xl"), USAGE_EXIT_CODE, "--printer goes with --labels"),
     ],
 )

@@ -194,3 +194,17 @@ def test_a_wrong_card_is_refused(tmp_path: Path, old: str, new: str, error: type
 
 def test_material_errors_are_errors_that_a_user_can_fix() -> None:
     assert issubclass(MaterialError, Fab4dError)
+
+
+def test_the_printer_may_say_what_points_up(tmp_path: Path) -> None:
+    assert scene(tmp_path, MINIMAL).printer.up == (0.0, 0.0, 1.0)
+    assert scene(tmp_path, MINIMAL + "[printer]\nup = [3, 0, -4]\n").printer.up == pytest.approx((0.6, 0.0, -0.8))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [("[0, 0, 0]", "not all zero"), ("[0, 1]", "a list of 3"), ('"z"', "a list of 3"), ("[nan, 0, 1]", "finite")],
+)
+def test_a_direction_that_is_none_is_refused(tmp_path: Path, value: str, message: str) -> None:
+    with pytest.raises(SceneError, match=rf"\[printer\] up must be .*{message}"):
+        scene(tmp_path, MINIMAL + f"[printer]\nup = {value}\n")
