@@ -21,7 +21,7 @@ FIELDS = [
     *("verdict", "reasons", "error", "target_displacement_mm", "target_projection", "smp_fraction", "forces"),
     *("ambiguous_fraction", "isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual"),
     *("min_det_F", "element_order", "force_change", "force_uncertainty", "mass_g", "cost_usd", "sensitivity"),
-    *("printing", "tau_s", "wall_s"),
+    *("printing", "picked", "tau_s", "wall_s"),
     *("peak_rss_mb", "findings", "left_out", "stages", "versions", "inputs"),
 ]
 
