@@ -8,7 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from fab4d.design.equilibria import Equilibria, Final, Median
-from fab4d.design.gauss_newton import Design, equilibrate, evaluate, gauss_newton_step, held_positions
+from fab4d.design.exchange import exchanged
+from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, gauss_newton_step, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
@@ -19,6 +20,10 @@ START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
 FIRST_DAMPING, LARGEST_DAMPING = 0.3, 30.0
 FIRST_LAM_ROUND = 0.02
+# Points are exchanged after this many relaxed steps, so many times at most, and not where the error is below this share
+# of the tolerance.
+EXCHANGE_AFTER, EXCHANGED, GOOD_ENOUGH = 3, 4, 0.25
+STEPS_AFTER_EXCHANGE = 2
 # While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
 ROUNDING_LOSS = 2.5
 # Held at fewer points, a part without a clamp can turn about the line through them.
@@ -42,6 +47,7 @@ class Phase(Enum):
     """What the solver does next."""
 
     RELAX = "relax"
+    EXCHANGE = "exchange"
     ROUND = "round"
     DONE = "done"
 
@@ -51,6 +57,7 @@ class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
     phase : of the next step        iteration, slow : steps of this phase, and how many of the last gained little
+    exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
     """
 
@@ -62,6 +69,7 @@ class Search:
     damping: float = FIRST_DAMPING
     iteration: int = 0
     slow: int = 0
+    exchanges: int = 0
     accepted: bool = True
     relaxed_rms: float = np.inf
 
@@ -81,7 +89,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
         at = Search(*first_design(problem, settings), lam_SMP=settings.weights.lam_SMP)
         watch(at)
     while at.phase is not Phase.DONE:
-        at = relax_step(at, settings, L) if at.phase is Phase.RELAX else round_step(at, settings, L)
+        at = STEPS[at.phase](at, settings, L)
         watch(at)
     return at
 
@@ -147,11 +155,43 @@ def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
     slow = at.slow + 1 if step.value > 0.98 * value else 0
     after = replace(at, design=step.design, damping=step.damping, accepted=step.accepted, slow=slow)
-    if not step.accepted or slow == 2 or at.iteration + 1 == settings.relax_iterations:
+    if at.exchanges < EXCHANGED and (not step.accepted or slow == 2 or at.iteration + 1 == EXCHANGE_AFTER):
+        return replace(after, phase=Phase.EXCHANGE, iteration=at.iteration + 1)
+    if not step.accepted or slow == 2 or at.iteration + 1 >= settings.relax_iterations:
         rms = shape_error(at.equilibria.problem, step.design.final.y).rms
         rounding = replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, relaxed_rms=rms)
         return replace(rounding, iteration=0, slow=0)
     return replace(after, iteration=at.iteration + 1)
+
+
+def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
+    """Hold other points where that promises a lower objective and keeps it; relaxing goes on with either."""
+    weights = settings.weights.replace(lam_SMP=at.lam_SMP)
+    done = replace(at, phase=Phase.RELAX, exchanges=EXCHANGED, slow=0)
+    if shape_error(at.equilibria.problem, at.design.final.y).rms <= GOOD_ENOUGH * weights.error_scale:
+        return done
+    model = build_model(at.equilibria, weights, L, at.design)
+    found = exchanged(at.equilibria, weights, model, at.design, settings.patch_radius)
+    if found is None:
+        return done
+    equilibria, design = found
+    damping = FIRST_DAMPING
+    for _ in range(STEPS_AFTER_EXCHANGE):
+        step = gauss_newton_step(equilibria, weights, L, design, damping)
+        design, damping = step.design, step.damping
+    if evaluate(equilibria, weights, L, design) > evaluate(at.equilibria, weights, L, at.design):
+        return done
+    return replace(
+        at,
+        equilibria=equilibria,
+        design=design,
+        phase=Phase.RELAX,
+        damping=damping,
+        iteration=0,
+        slow=0,
+        exchanges=at.exchanges + 1,
+        accepted=True,
+    )
 
 
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
@@ -176,6 +216,9 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
         iteration=at.iteration + 1,
         accepted=step.accepted,
     )
+
+
+STEPS = {Phase.RELAX: relax_step, Phase.EXCHANGE: exchange_step, Phase.ROUND: round_step}
 
 
 def undecided_fraction(rho: FloatArray) -> float:

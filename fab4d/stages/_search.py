@@ -12,7 +12,7 @@ from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
 from fab4d.io.scene import RigCard
 
-_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow", "relaxed_rms")
+_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms")
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:
@@ -41,5 +41,5 @@ def search_from(problem: Problem, rig: RigCard, saved: Mapping[str, np.ndarray])
         msg = "a saved state of the solver is not in equilibrium: run again with --force"
         raise ArtifactError(msg)
     numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
-    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow")}
+    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")}
     return Search(equilibria, design, Phase(str(saved["phase"])), **numbers)
