@@ -28,6 +28,8 @@ STEPS_AFTER_EXCHANGE = 2
 ROUNDING_LOSS = 2.5
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
+# The smallest number of points is looked for from here.
+FIRST_COUNT = 4
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,44 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
         at = STEPS[at.phase](at, settings, L)
         watch(at)
     return at
+
+
+def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch) -> Search:
+    """The best relaxed design: the search from its start as far as rounding.
+
+    Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
+    """
+    L = smoothness_matrix(problem)
+    at = Search(*first_design(problem, settings), lam_SMP=settings.weights.lam_SMP)
+    while at.phase in (Phase.RELAX, Phase.EXCHANGE):
+        watch(at)
+        at = STEPS[at.phase](at, settings, L)
+    return at
+
+
+def fewest_points(problem: Problem, settings: ReducedSettings, enough: float, watch: Watch) -> int:
+    """The fewest points, `settings.n_points` at most, whose relaxed design has an RMS error of at most `enough`, L0.
+
+    By doubling and bisection, so it is the smallest if more points are never worse. The most if none is enough.
+    """
+
+    def meets(count: int) -> bool:
+        try:
+            found = relaxed(problem, replace(settings, n_points=count), watch)
+        except EquilibriumError:
+            return False
+        return found.relaxed_rms <= enough
+
+    most = settings.n_points
+    low, high = 0, min(FIRST_COUNT, most)
+    while not meets(high):
+        if high == most:
+            return most
+        low, high = high, min(2 * high, most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if meets(middle) else (middle, high)
+    return high
 
 
 # -- start

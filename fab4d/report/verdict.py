@@ -7,6 +7,7 @@ from typing import Any
 from fab4d.report.wording import plain
 
 ACCEPTED, REJECTED = "ACCEPTED", "REJECTED"
+ERROR_CHECK = "RMS error"
 LARGEST_RESIDUAL = 1e-8
 """Largest residual of an equilibrium, relative to the largest force."""
 DEFAULT_TOLERANCE = 5e-3
@@ -43,7 +44,7 @@ def checks_of(figures: Mapping[str, Any], limits: Limits) -> list[Check]:
     """The checks of the figures of report.json; a figure that was not measured (None) is not checked."""
     residual = figures["equilibrium_residual"]
     found = [
-        _at_most("RMS error", figures["error"]["rms_mm"], limits.tolerance, " mm"),
+        _at_most(ERROR_CHECK, figures["error"]["rms_mm"], limits.tolerance, " mm"),
         _at_most("number of forces", figures["forces"], limits.max_forces),
         _at_most("SMP share of the volume", figures["smp_fraction"], limits.max_smp_fraction),
         _below("share of ambiguous tets", figures["ambiguous_fraction"], limits.max_ambiguous_fraction),
@@ -74,7 +75,14 @@ def reasons_of(checks: list[Check], reports: Mapping[str, Mapping[str, Any] | No
     verify = reports.get("verify_report")
     if verify and not verify["reached"]:
         said.insert(0, "the forward simulation from the permanent shape did not reach the designed state")
-    return list(dict.fromkeys([c.reason for c in checks if not c.passed] + said))
+    failed = [c.reason + _limit_of(c, reports.get("solve_report")) for c in checks if not c.passed]
+    return list(dict.fromkeys(failed + said))
+
+
+def _limit_of(check: Check, solve_report: Mapping[str, Any] | None) -> str:
+    """What limits the error, if the solver knows."""
+    limited = (solve_report or {}).get("limited_by")
+    return f"; limited by {limited}" if limited and check.name == ERROR_CHECK else ""
 
 
 def left_out_of(reports: Mapping[str, Mapping[str, Any] | None]) -> list[dict[str, str]]:

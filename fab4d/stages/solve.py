@@ -1,13 +1,15 @@
 """Stage `solve`: a near 0/1 density and the points to hold, so that the part takes the temporary shape."""
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from fab4d.design.objective import force_excess, shape_error, stretch_excess
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, solve_reduced
+from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, solve_reduced
 from fab4d.errors import SceneError
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
@@ -16,13 +18,17 @@ from fab4d.stages._printed import as_printed
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
 
-CHECKPOINT, BEST = "iterate", "best"
+CHECKPOINT, BEST, POINTS = "iterate", "best", "points"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
 USUAL_SMP_FRACTION = 0.5
 LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors this mesh in memory"}]
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
+# Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
+# attempts as many times more.
+RELAXED_SHARE = 0.6
+MORE_POINTS = (1.0, 1.3, 1.8)
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
@@ -45,7 +51,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     found, attempts, rms = _search(problem, mesh, profile, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
-        settings = search_settings(problem, profile, attempts - 1)
+        settings = search_settings(problem, profile, attempts - 1, found.equilibria.patches.count)
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
         least = least_smp(problem, mesh, sections, settings, found, trace, monitor)
         found, rms = least.found, least.printed_rms
@@ -55,6 +61,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "attempts": attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "least_smp": None if least is None else least.trials,
+        "limited_by": _limited_by(problem, profile, found),
         "left_out": LEFT_OUT,
     }
     return _artifacts(problem, found, trace, report)
@@ -87,8 +94,9 @@ def _search(
     """The best design of the attempts made, how many were made, and its RMS error as printed, in L0."""
     first, start = _resumed(problem, profile, trace, monitor)
     best, least = _restored_best(problem, profile, monitor)
+    count = _points(problem, profile, trace, monitor)
     for attempt in range(first, len(ATTEMPTS)):
-        settings = search_settings(problem, profile, attempt)
+        settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
         watch = _watch(attempt, start, trace, monitor)
         found = solve_reduced(problem, settings, watch, start)
         start, weights = None, settings.weights
@@ -96,7 +104,7 @@ def _search(
         if best is None or rms < least:
             best, least = found, rms
             monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
-        if least <= settings.weights.error_scale:
+        if least <= settings.weights.error_scale or _hopeless(profile, settings, found):
             break
     assert best is not None  # at least one attempt is made
     return best, attempt + 1, least
@@ -116,14 +124,72 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor) -
     return watch
 
 
-def search_settings(problem: Problem, profile: Mapping[str, Any], attempt: int = 0) -> ReducedSettings:
-    """The solver's settings for one of the ATTEMPTS. profile : sections goal, rig, weights and materials"""
+def _hopeless(profile: Mapping[str, Any], settings: ReducedSettings, found: Search) -> bool:
+    """Whether other attempts, which make rounding cost less, cannot help: the relaxed design misses the tolerance."""
+    asked = profile["goal"].max_forces is not None or settings.n_points == profile["rig"].max_points
+    return asked and found.relaxed_rms > settings.weights.error_scale
+
+
+def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> str | None:
+    """What keeps the relaxed design, each tet any mixture, from the goal; None where it comes near enough."""
+    weights = search_settings(problem, profile).weights
+    if found.relaxed_rms <= weights.error_scale:
+        return None
+    median, limits = found.design.median, []
+    if (force_excess(median.forces, weights.max_force) > 0).any():
+        limits.append("the largest force of the rig")
+    if len(stretch_excess(problem, weights, found.design.rho, median.x).tets):
+        limits.append("the largest stretch of the materials")
+    what = " and ".join(limits) if limits else f"the number of points, {found.equilibria.patches.count}"
+    error = shape_error(problem, found.design.final.y).e
+    worst = problem.body.X[np.argmax(np.linalg.norm(error, axis=1))] * problem.length
+    place = ", ".join(f"{x:.3g}" for x in worst)
+    left = found.relaxed_rms * problem.length
+    return (
+        f"{what}: with any mixture of materials in each tet the error stays at {left:.3g} mm, "
+        f"most of all near ({place}) mm of the printed part"
+    )
+
+
+def _points(problem: Problem, profile: Mapping[str, Any], trace: Trace, monitor: Monitor) -> int:
+    """The number of points: what the scene asks for, or else the fewest that meet the tolerance."""
+    goal, rig = profile["goal"], profile["rig"]
+    if goal.max_forces is not None:
+        return most_points(goal, rig)
+    saved = monitor.restore(POINTS)
+    if saved is not None:
+        return int(saved["count"])
+    settings = search_settings(problem, profile)
+    enough = RELAXED_SHARE * settings.weights.error_scale
+    count = fewest_points(problem, settings, enough, lambda at: trace.add("points", at))
+    monitor.save(POINTS, {"count": np.array(count)})
+    return count
+
+
+def _tried(profile: Mapping[str, Any], attempt: int, count: int) -> int:
+    """Points of an attempt: `count`, or more in later attempts where the scene names no number."""
+    goal, rig = profile["goal"], profile["rig"]
+    return count if goal.max_forces is not None else min(math.ceil(MORE_POINTS[attempt] * count), rig.max_points)
+
+
+def most_points(goal: Goal, rig: RigCard) -> int:
+    """The number of points asked for, or else the most that the rig has."""
+    return rig.max_points if goal.max_forces is None else min(goal.max_forces, rig.max_points)
+
+
+def search_settings(
+    problem: Problem, profile: Mapping[str, Any], attempt: int = 0, n_points: int | None = None
+) -> ReducedSettings:
+    """The solver's settings for one of the ATTEMPTS, with `most_points` if no number is given.
+
+    profile : sections goal, rig, weights and materials
+    """
     goal: Goal = profile["goal"]
     rig: RigCard = profile["rig"]
     weights = objective_weights(problem, goal, profile["weights"], rig, profile["materials"])
     smooth, smp = ATTEMPTS[attempt]
     return ReducedSettings(
-        n_points=rig.max_points if goal.max_forces is None else min(goal.max_forces, rig.max_points),
+        n_points=most_points(goal, rig) if n_points is None else n_points,
         patch_radius=rig.patch_radius / problem.length,
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,

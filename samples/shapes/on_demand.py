@@ -37,7 +37,7 @@ def _flower(mesh: Callable[[], Mesh]) -> Sample:
 
 def _key(mesh: Callable[[], Mesh]) -> Sample:
     X, tets = mesh()
-    return Sample("A key whose teeth change.", X, teeth.teeth_bent(X), tets, teeth.CLAMP, 12, 5e-3)
+    return Sample("A key whose teeth change.", X, teeth.teeth_bent(X), tets, teeth.CLAMP, 12, 1.7e-3)
 
 
 ARM_LENGTH, ARM_WIDTH = 168.0, 14.0

@@ -17,8 +17,10 @@ from fab4d.design.reduced import (
     Search,
     at_rest,
     change_density,
+    fewest_points,
     polished,
     refit,
+    relaxed,
     solve_reduced,
     undecided_fraction,
 )
@@ -105,11 +107,26 @@ def test_states_are_in_equilibrium_and_within_bounds(searched: list[Search]) -> 
 
 
 def test_phases_follow_each_other(searched: list[Search]) -> None:
-    phases = [at.phase for at in searched]
+    phases = [at.phase for at in searched if at.phase is not Phase.EXCHANGE]
     assert phases == sorted(phases, key=list(Phase).index)
     assert phases[-1] is Phase.DONE
-    relaxed = [rms(at.equilibria.problem, at.design) for at in searched if at.phase is Phase.RELAX]
-    assert relaxed[-1] < 0.5 * relaxed[0]
+    errors = [rms(at.equilibria.problem, at.design) for at in searched if at.phase is Phase.RELAX]
+    assert errors[-1] < 0.5 * errors[0]
+
+
+def test_the_fewest_points_meet_the_error_and_one_less_does_not() -> None:
+    problem = bar(cells=(6, 2, 2), degrees=60.0)
+    settings, seen = settings_for(problem, n_points=8), []
+
+    def error_with(count: int) -> float:
+        return relaxed(problem, replace(settings, n_points=count), lambda at: None).relaxed_rms  # noqa: ARG005
+
+    enough = 1.001 * error_with(3)
+    count = fewest_points(problem, settings, enough, seen.append)
+    assert error_with(count) <= enough
+    assert count == 1 or error_with(count - 1) > enough
+    assert {at.equilibria.patches.count for at in seen} >= {count, 4}
+    assert fewest_points(problem, replace(settings, n_points=2), 0.0, seen.append) == 2
 
 
 def test_going_on_from_any_state_ends_with_the_same_bits(truth: Truth, searched: list[Search]) -> None:

@@ -1,13 +1,17 @@
-"""A mesh for stages that need one, and a monitor with a memory."""
+"""A mesh for stages that need one, a monitor with a memory, and a way to the shapes of `samples/`."""
 
+import sys
 from collections.abc import Mapping
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fab4d.mesh.measures import tet_volumes
 from fab4d.stages.monitor import SilentMonitor
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "samples"))
 
 
 class Memory(SilentMonitor):
