@@ -26,7 +26,7 @@ PROFILE = {
 @pytest.fixture(scope="module")
 def bar() -> dict[str, np.ndarray]:
     """A bar clamped at its left end that wants to be bent by 50 degrees."""
-    X, tets = box(SIZE, (8, 2, 2), "five")
+    X, tets = box(SIZE, (7, 1, 1), "five")
     line = rod((8.0, SIZE[1] / 2, SIZE[2] / 2), (SIZE[0], SIZE[1] / 2, SIZE[2] / 2), (0, 0, 1))
     bent = warped(X, line, (Turn((0, 0, 1), 50.0, lambda s: ramp(s, 0, 5)),))
     return {"X": X, "X_temp": bent, "tets": tets, "clamp": X[:, 0] <= 8.0}
@@ -53,9 +53,9 @@ def test_a_number_is_met_exactly(bar: dict[str, np.ndarray]) -> None:
 
 def test_a_goal_out_of_reach_says_what_limits_it(bar: dict[str, np.ndarray]) -> None:
     """One try is enough, for other weights cannot help."""
-    report = solved(bar, Goal(tolerance=1e-3, max_forces=1))["solve_report"]
+    report = solved(bar, Goal(tolerance=0.02, max_forces=1))["solve_report"]
     assert report["attempts"] == 1
     assert report["limited_by"].startswith("the number of points, 1: with any mixture")
     weak = replace(PROFILE["rig"], max_force=20.0)
-    report = solved(bar, Goal(tolerance=1e-3, max_forces=2), rig=weak)["solve_report"]
+    report = solved(bar, Goal(tolerance=0.02, max_forces=1), rig=weak)["solve_report"]
     assert report["limited_by"].startswith("the largest force of the rig")
