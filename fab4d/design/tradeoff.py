@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import EXCHANGED, FIRST_DAMPING, Phase, ReducedSettings, Search, Watch, solve_reduced
+from fab4d.design.reduced import FIRST_DAMPING, Phase, ReducedSettings, Search, Watch, solve_reduced
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # Rounding is a jump: one price too high may be bad luck, two in a row are not.
@@ -32,8 +32,10 @@ def search_at(
 
 
 def repriced(start: Search, lam_SMP: float) -> Search:
-    """The design of `start`, about to be relaxed at another price of SMP, at the same points."""
-    return Search(start.equilibria, start.design, Phase.RELAX, lam_SMP, damping=FIRST_DAMPING, exchanges=EXCHANGED)
+    """The design of `start`, about to be relaxed at another price of SMP."""
+    return Search(
+        start.equilibria, start.design, Phase.RELAX, lam_SMP, damping=FIRST_DAMPING, exchanges=start.exchanges
+    )
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def bar() -> dict[str, np.ndarray]:
 
 
 def solved(mesh: dict[str, np.ndarray], goal: Goal, **profile: Any) -> dict[str, Any]:
-    inputs = {"mesh": mesh, "check_report": {"nothing_to_program": False}}
+    inputs = {"mesh": mesh, "check_report": {"nothing_to_program": False}, "picked": None}
     return run(inputs, PROFILE | {"goal": goal} | profile, SilentMonitor())
 
 
