@@ -16,6 +16,7 @@ from fab4d.stages.monitor import SilentMonitor
 PRINTER = load_printer("generic-dual-0.4", Path())
 PROFILE = {"name": "box", "printer": PRINTER, "materials": load_material("paper-corrected", Path())}
 SAMPLES = Path(__file__).parents[2] / "samples"
+every_sample = pytest.mark.parametrize("sample", ["strip", "twist-bar", "tower", "gripper", "fin", "smiley", "snake"])
 FAKE = Slicer("prusa", Path("fake"))
 
 
@@ -45,7 +46,7 @@ def test_bodies_are_laid_down_by_their_tools(files, slicer):
     assert report["print_time_s"] > 600
 
 
-@pytest.mark.parametrize("size", [2.0, 5.0])
+@pytest.mark.parametrize("size", [1.5, 2.0])
 def test_coin_toss_labels_are_laid_down_too(mesh, slicer, size):
     raw = RawMesh(mesh["X"] * size / 5, mesh["tets"], {}, "box.vtu")
     smp = np.random.default_rng(1).random(len(raw.tets)) < 0.5
@@ -55,15 +56,35 @@ def test_coin_toss_labels_are_laid_down_too(mesh, slicer, size):
     assert [check["ok"] for check in report["checks"]] == [True, True]
 
 
-@pytest.mark.parametrize("sample", ["strip", "twist-bar", "gripper", "smiley"])
-def test_samples_are_laid_down_in_stripes_too(slicer, sample):
-    """Stripes of both materials across the longest side."""
+def stripes(centres):
+    """Five, of both materials in turn, across the longest side."""
+    along = centres[:, np.argmax(np.ptp(centres, axis=0))]
+    return np.floor(4.999 * (along - along.min()) / np.ptp(along)).astype(int) % 2 == 0
+
+
+def coins(centres):
+    return np.random.default_rng(1).random(len(centres)) < 0.5
+
+
+def sliced_sample(slicer, sample, labels):
     raw = read_mesh(SAMPLES / sample / "perm.vtu")
-    centres = raw.points[raw.tets].mean(axis=1)
-    along = centres[:, np.argmax(np.ptp(raw.points, axis=0))]
-    smp = np.floor(5 * (along - along.min()) / np.ptp(along)).astype(int) % 2 == 0
+    smp = labels(raw.points[raw.tets].mean(axis=1))
     files = labelled_bodies(raw, smp, 1.0, sample, PROFILE["printer"], PROFILE["materials"])
-    assert [check["ok"] for check in slicing.slice_report(slicer, files)["checks"]] == [True, True]
+    return slicing.slice_report(slicer, files)
+
+
+@every_sample
+def test_samples_are_laid_down_in_stripes_too(slicer, sample):
+    report = sliced_sample(slicer, sample, stripes)
+    assert [(check["ok"], check["value"]) for check in report["checks"] if not check["ok"]] == []
+
+
+@pytest.mark.slow
+@every_sample
+def test_samples_are_laid_down_with_tossed_coins_too(slicer, sample):
+    report = sliced_sample(slicer, sample, coins)
+    assert [(check["ok"], check["value"]) for check in report["checks"] if not check["ok"]] == []
+    assert min(body["volume_mm3"] for body in report["bodies"].values()) > 0
 
 
 def lay_down(monkeypatch, *volumes):
