@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fab4d.design.objective import smoothness_matrix
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import FIRST_DAMPING, Phase, ReducedSettings, Search, Watch, solve_reduced
+from fab4d.design.reduced import FIRST_DAMPING, STEPS, Phase, ReducedSettings, Search, Watch, solve_reduced
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # Rounding is a jump: one price too high may be bad luck, two in a row are not.
@@ -20,15 +21,17 @@ def search_at(
     problem: Problem, settings: ReducedSettings, start: Search, lam_SMP: float, watch: Watch
 ) -> tuple[Search, Search]:
     """The relaxed and the near 0/1 design at the price lam_SMP, set out from the relaxed design `start` of another."""
-    relaxed = []
+    relaxed = relaxed_at(problem, settings, start, lam_SMP, watch)
+    return relaxed, solve_reduced(problem, settings, watch, relaxed)
 
-    def keep(at: Search) -> None:
-        if at.phase is Phase.ROUND and at.iteration == 0:
-            relaxed.append(at)
+
+def relaxed_at(problem: Problem, settings: ReducedSettings, start: Search, lam_SMP: float, watch: Watch) -> Search:
+    """The design of `start` relaxed at the price lam_SMP, about to be rounded."""
+    L, at = smoothness_matrix(problem), repriced(start, lam_SMP)
+    while at.phase is not Phase.ROUND:
+        at = STEPS[at.phase](at, settings, L)
         watch(at)
-
-    found = solve_reduced(problem, settings, keep, repriced(start, lam_SMP))
-    return relaxed[0], found
+    return at
 
 
 def repriced(start: Search, lam_SMP: float) -> Search:
@@ -72,6 +75,14 @@ def least(trials: Sequence[Trial]) -> int:
     """Number of the acceptable trial with the least SMP. Raises ValueError when there is none."""
     acceptable = [k for k, trial in enumerate(trials) if trial.acceptable]
     return min(acceptable, key=lambda k: trials[k].smp_fraction)
+
+
+def way_to(price: float) -> list[float]:
+    """The prices over which `price` is reached from 1, by doubling or halving: 3 by 1, 2 and 3."""
+    way = [1.0]
+    while way[-1] != price:
+        way.append(min(2 * way[-1], price) if price > way[-1] else max(way[-1] / 2, price))
+    return way
 
 
 def nearest(prices: Sequence[float], price: float) -> int:

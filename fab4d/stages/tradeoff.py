@@ -3,14 +3,14 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import ReducedSettings, Search, first_design
-from fab4d.design.tradeoff import nearest, search_at
+from fab4d.design.reduced import ReducedSettings, Search, Watch, first_design, solve_reduced
+from fab4d.design.tradeoff import relaxed_at, way_to
 from fab4d.errors import EquilibriumError, SceneError
 from fab4d.report.metrics import mass_and_cost
 from fab4d.report.tradeoff import tradeoff_csv, tradeoff_plot
@@ -45,7 +45,8 @@ def run(
     unmade = []
     for count in sorted(set(points or usual_points(study.settings.n_points))):
         try:
-            study.chain(count, sorted(set(prices), key=lambda price: abs(np.log(price))))
+            for price in sorted(set(prices), key=lambda price: abs(np.log(price))):
+                study.make(count, price)
         except EquilibriumError as error:
             unmade.append(f"{count} points: {error}")
     rows = study.kept_rows()
@@ -73,61 +74,63 @@ def _refuse(inputs: Mapping[str, Any], profile: Mapping[str, Any], settings: Red
         raise SceneError(msg)
 
 
-@dataclass(frozen=True, eq=False)
-class _Made:
-    """A row with the price of its relaxed design, from which its neighbours set out."""
-
-    price: float
-    relaxed: Search
-
-
 class _Study:
     """What the rows share."""
 
     def __init__(self, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], monitor: Monitor) -> None:
         self.mesh, self.profile, self.monitor = mesh, profile, monitor
         self.problem: Problem = problem_of(mesh, profile["materials"], "linear")
-        # The curve goes beyond the share of SMP at which a single search turns back.
-        limit = profile["goal"].max_smp_fraction
-        usual = search_settings(self.problem, profile)
-        self.settings = replace(usual, max_smp_fraction=1.0 if limit is None else limit)
+        self.settings = search_settings(self.problem, profile)
         self.sections = {name: profile[name] for name in ("rig", "goal", "acceptance")}
         monitor.progress("compile, measure tau")
         self.tau_s = tau_seconds(self.problem)
 
     def kept_rows(self) -> list[Row]:
         """All rows that were ever made for these inputs, by points and price."""
-        rows = [json.loads(str(self._kept(name)["row"])) for name in self._names()]
+        kept = [self.monitor.restore(name) for name in self._names()]
+        rows = [json.loads(str(arrays["row"])) for arrays in kept if arrays is not None]
         return sorted(rows, key=lambda row: (row["points"], row["lam_SMP"]))
 
-    def chain(self, count: int, prices: Sequence[float]) -> None:
-        """The rows of one number of points; the first is searched from the start, the others from their neighbours."""
-        settings, made = replace(self.settings, n_points=count), []
-        for price in prices:
-            name = f"{count}x{price:g}"
-            if name in self._names():
-                made.append(_Made(price, self._recalled(self._kept(name))))
-            else:
-                made.append(_Made(price, self._row(name, settings, price, made)))
-
-    def _row(self, name: str, settings: ReducedSettings, price: float, made: Sequence[_Made]) -> Search:
-        """Make and keep the row; returns its relaxed design."""
+    def make(self, count: int, price: float) -> None:
+        """Make and keep the row of a number of points and a price, if there is none."""
+        name, settings = _name(count, price), self._settings(count, price)
+        if name in self._names():
+            return
         began, trace = time.perf_counter(), Trace(self.problem, self.mesh, self.monitor, self.tau_s)
-        lam_SMP = price * settings.weights.lam_SMP
-        start = (
-            made[nearest([other.price for other in made], price)].relaxed
-            if made
-            else Search(*first_design(self.problem, settings))
-        )
-        relaxed, found = search_at(self.problem, settings, start, lam_SMP, lambda at: trace.add(name, at))
+
+        def watch(at: Search) -> None:
+            trace.add(name, at)
+
+        found = solve_reduced(self.problem, settings, watch, self._relaxed(settings, price, watch))
         self.monitor.progress(f"{name} as printed")
-        printed = as_printed(
-            self.problem, self.mesh, self.profile["printer"], self.profile["goal"], settings.weights, found
-        )
-        row = self._figures(settings, found, printed) | {"id": name, "lam_SMP": lam_SMP}
+        printer, goal = self.profile["printer"], self.profile["goal"]
+        printed = as_printed(self.problem, self.mesh, printer, goal, settings.weights, found)
+        row = self._figures(settings, found, printed) | {"id": name, "lam_SMP": price * settings.weights.lam_SMP}
         row["tau"] = (time.perf_counter() - began) / self.tau_s
-        self._keep(name, row, relaxed, found)
-        return relaxed
+        self.monitor.save(name, search_arrays(found) | {"row": np.array(json.dumps(row))})
+        self.monitor.save(INDEX, {"names": np.array([*self._names(), name], dtype=np.str_)})
+
+    def _settings(self, count: int, price: float) -> ReducedSettings:
+        """Those of stage solve, but where SMP is cheaper than usual, more of it than usual may be used."""
+        limit = self.profile["goal"].max_smp_fraction
+        if price < 1 and limit is None:
+            return replace(self.settings, n_points=count, max_smp_fraction=1.0)
+        return replace(self.settings, n_points=count)
+
+    def _relaxed(self, settings: ReducedSettings, price: float, watch: Watch) -> Search:
+        """The relaxed design, reached over the same prices whatever rows there are: a row hangs on nothing else."""
+        at = None
+        for way in way_to(price):
+            name = f"relaxed-{_name(settings.n_points, way)}"
+            kept = self.monitor.restore(name)
+            if kept is None:
+                start = at or Search(*first_design(self.problem, settings))
+                at = relaxed_at(self.problem, settings, start, way * settings.weights.lam_SMP, watch)
+                self.monitor.save(name, search_arrays(at))
+            else:
+                at = search_from(self.problem, self.profile["rig"], kept)
+        assert at is not None  # every way has a beginning
+        return at
 
     def _figures(self, settings: ReducedSettings, found: Search, printed: Printed) -> Row:
         problem, design = self.problem, printed.design
@@ -146,24 +149,13 @@ class _Study:
             "reasons": reasons,
         }
 
-    def _keep(self, name: str, row: Row, relaxed: Search, found: Search) -> None:
-        """The design under the names that stage solve reads, the relaxed one beside it."""
-        beside = {f"relaxed_{key}": value for key, value in search_arrays(relaxed).items()}
-        self.monitor.save(name, search_arrays(found) | beside | {"row": np.array(json.dumps(row))})
-        self.monitor.save(INDEX, {"names": np.array([*self._names(), name], dtype=np.str_)})
-
     def _names(self) -> list[str]:
         index = self.monitor.restore(INDEX)
         return [] if index is None else index["names"].tolist()
 
-    def _kept(self, name: str) -> dict[str, np.ndarray]:
-        kept = self.monitor.restore(name)
-        assert kept is not None  # it is in the index
-        return kept
 
-    def _recalled(self, kept: Mapping[str, np.ndarray]) -> Search:
-        relaxed = {key.removeprefix("relaxed_"): value for key, value in kept.items() if key.startswith("relaxed_")}
-        return search_from(self.problem, self.profile["rig"], relaxed)
+def _name(count: int, price: float) -> str:
+    return f"{count}x{price:g}"
 
 
 def _largest(forces: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from fab4d.design.tradeoff import (
     next_price,
     pareto_front,
     search_at,
+    way_to,
 )
 
 
@@ -67,6 +68,16 @@ def test_a_bracket_that_saves_nothing_ends_the_search() -> None:
     tried = [Trial(1.0, 0.3, True), Trial(2.0, 0.295, False), Trial(4.0, 0.1, False)]
     assert next_price(tried) is None
     assert next_price([tried[0], Trial(2.0, 0.2, False), tried[2]]) == pytest.approx(2**0.5)
+
+
+@given(st.floats(1e-2, 1e2))
+def test_the_way_to_a_price_is_made_of_doublings_or_halvings(price: float) -> None:
+    way = way_to(price)
+    assert (way[0], way[-1]) == (1, price)
+    ratios = np.array(way[1:]) / np.array(way[:-1])
+    assert set(ratios[:-1]) <= {2.0 if price > 1 else 0.5}
+    assert all(0.5 <= ratio <= 2 for ratio in ratios)
+    assert len(way) == 1 + np.ceil(abs(np.log2(price)))
 
 
 @given(st.floats(1e-3, 1e3))

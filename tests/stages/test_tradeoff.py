@@ -74,17 +74,17 @@ def test_a_finished_row_is_not_made_again_and_a_lost_one_comes_out_equal(
     scene: Scene, checked: dict[str, Any], memory: Any, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows, whole = kept
-    killed = memory({name: arrays for name, arrays in whole.saved.items() if name != "3x4"})
+    killed = memory({name: arrays for name, arrays in whole.saved.items() if name == "3x1"})
     killed.saved["index"] = {"names": np.array(["3x1"])}
-    prices, search_at = [], tradeoff.search_at
+    searched, solve_reduced = [], tradeoff.solve_reduced
 
-    def counted(problem: Any, settings: Any, start: Any, lam_SMP: float, watch: Any) -> Any:
-        prices.append(lam_SMP)
-        return search_at(problem, settings, start, lam_SMP, watch)
+    def counted(problem: Any, settings: Any, watch: Any, start: Any) -> Any:
+        searched.append(start.lam_SMP)
+        return solve_reduced(problem, settings, watch, start)
 
-    monkeypatch.setattr(tradeoff, "search_at", counted)
+    monkeypatch.setattr(tradeoff, "solve_reduced", counted)
     again = study(scene, checked, killed, points=[3], prices=[1.0, 4.0])
-    assert prices == pytest.approx([0.2])
+    assert searched == pytest.approx([0.2])
     assert [row | {"tau": ""} for row in again] == [row | {"tau": ""} for row in rows]
     for name in ("rho", "x", "y", "forces"):
         np.testing.assert_array_equal(killed.saved["3x4"][name], whole.saved["3x4"][name])
