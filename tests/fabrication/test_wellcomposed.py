@@ -145,14 +145,17 @@ def test_one_label_flips_end_the_search_alone(meshes):
 
 
 @pytest.mark.slow
-def test_hundred_thousand_tossed_coins_take_ten_seconds(meshes):
-    X, tets = meshes["box"]((26, 26, 25))
+@pytest.mark.parametrize("kind", ["box", "irregular"])
+def test_hundred_thousand_tossed_coins_take_ten_seconds(meshes, kind):
+    X, tets = meshes["box"]((26, 26, 25)) if kind == "box" else meshes["irregular"](15000, 8)
     smp = np.random.default_rng(0).random(len(tets)) < 0.5
     repaired(*meshes["box"]((2, 2, 2)), np.arange(48) % 2 == 0)
     start = process_time()
     result = repaired(X, tets, smp)
     assert process_time() - start < 10
+    assert len(tets) > 100000
     assert len(pinched_vertices(tets, result)) == 0
+    assert 0.4 < np.mean(result) < 0.6
 
 
 class TestPartThatTouchesItself:
