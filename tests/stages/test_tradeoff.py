@@ -15,6 +15,9 @@ from fab4d.io.meshes import read_mesh
 from fab4d.io.scene import Scene, Weights, load_scene
 from fab4d.runner.table import stage_table
 from fab4d.stages import check, solve, threshold, tradeoff
+from fab4d.stages._design import problem_of
+from fab4d.stages._printed import as_printed, faults
+from fab4d.stages._search import search_from
 from fab4d.stages.monitor import SilentMonitor
 
 STRIP = Path(__file__).parents[2] / "samples" / "strip"
@@ -128,3 +131,58 @@ def test_usual_points_are_half_to_all() -> None:
     assert tradeoff.usual_points(8) == [4, 6, 8]
     assert tradeoff.usual_points(3) == [2, 3]
     assert tradeoff.usual_points(1) == [1]
+
+
+@pytest.fixture(scope="module")
+def judged(scene: Scene, checked: dict[str, Any], kept: Kept) -> tuple[Any, ...]:
+    """Problem, design and print of row 3x1, which is acceptable."""
+    problem = problem_of(checked["mesh"], scene.materials, "linear")
+    found = search_from(problem, scene.rig, kept[1].saved["3x1"])
+    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    return problem, found, as_printed(problem, checked["mesh"], scene.printer, scene.goal, weights, found, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("goal", "rig", "acceptance", "tolerance_mm", "words"),
+    [
+        ({}, {}, {}, 1.0, None),
+        ({}, {}, {}, 0.01, "0.01 mm are allowed"),
+        ({"max_smp_fraction": 0.1}, {}, {}, 1.0, "10.0% are allowed"),
+        ({}, {"max_force": 20.0}, {}, 1.0, "the rig gives 20 N"),
+        ({}, {}, {"max_isolated_fraction": 0.0}, 1.0, "touch no other SMP tet"),
+    ],
+)
+def test_a_design_is_judged_by_goal_rig_and_acceptance(
+    scene: Scene,
+    checked: dict[str, Any],
+    judged: tuple[Any, ...],
+    goal: Any,
+    rig: Any,
+    acceptance: Any,
+    tolerance_mm: float,
+    words: str | None,
+) -> None:
+    problem, found, printed = judged
+    sections = {
+        "goal": replace(scene.goal, **goal),
+        "rig": replace(scene.rig, **rig),
+        "acceptance": replace(scene.acceptance, **acceptance),
+    }
+    seen = faults(problem, checked["mesh"]["tets"], sections, found, printed, tolerance_mm / problem.length)
+    assert len(seen) == (words is not None)
+    assert words is None or words in seen[0]
+
+
+def test_a_state_that_loading_does_not_reach_is_not_acceptable(
+    scene: Scene, checked: dict[str, Any], judged: tuple[Any, ...]
+) -> None:
+    """The same forces and positions on a median shape that is moved elsewhere."""
+    problem, found, printed = judged
+    median = printed.design.median
+    moved = replace(printed.design, median=replace(median, x=median.x + 1e-3 * ~problem.clamp[:, None]))
+    sections = {name: getattr(scene, name) for name in ("goal", "rig", "acceptance")}
+    tets, tolerance = checked["mesh"]["tets"], 1.0 / problem.length
+    seen = faults(problem, tets, sections, found, replace(printed, design=moved), tolerance)
+    assert seen == ["loading from the permanent shape does not end in the designed state"]
+    lost = faults(problem, tets, sections, found, replace(printed, design=None), tolerance)
+    assert lost == ["the printed labels have no equilibrium near the design"]
