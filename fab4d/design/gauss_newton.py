@@ -53,6 +53,9 @@ def equilibrate(
     return Design(rho, median, final) if final.solution.converged else None
 
 
+TRIAL_ITERATIONS = 8
+# A step that is predicted to move a node farther than this, in L0, is not tried.
+LARGEST_MOVE = 0.1
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
 HELD_STEP = 0.05
 
@@ -271,17 +274,14 @@ def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | Non
 
 
 def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArray, dc: FloatArray) -> Design | None:
-    """The equilibria after a step: from the linear prediction, or else from where the design is."""
+    """The equilibria after a step, from its linear prediction; None where that goes too far to be of use."""
     dx, df, dy = model.lin.forward(drho, dc)
+    if max(np.abs(dx).max(), np.abs(dy).max()) > LARGEST_MOVE:
+        return None
     median, y = design.median, design.final.y
     rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
-    ahead = equilibria.held_turning.step(median.x, dx), median.forces + df, equilibria.free_turning.step(y, dy)
-    guesses = (ahead, (median.x, median.forces, y))
-    for x0, f0, y0 in guesses:
-        trial = equilibrate(equilibria, rho, held, x0, f0, y0)
-        if trial is not None:
-            return trial
-    return None
+    x0, y0 = equilibria.held_turning.step(median.x, dx), equilibria.free_turning.step(y, dy)
+    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=TRIAL_ITERATIONS)
 
 
 def held_positions(equilibria: Equilibria, median: Median) -> FloatArray:
