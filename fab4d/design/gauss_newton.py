@@ -13,7 +13,7 @@ from fab4d.design.objective import (
     ObjectiveWeights,
     ShapeMetric,
     density_terms,
-    force_excess,
+    forces_beyond,
     objective_value,
     shape_error,
     shape_metric,
@@ -143,19 +143,19 @@ class DampedModel:
 
 def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design) -> Model:
     """Linearise both equilibria at the design and form the quadratic model."""
-    problem, f = equilibria.problem, design.median.forces
+    problem = equilibria.problem
     lin = linearise(equilibria, design.rho, design.median, design.final)
     error = shape_error(problem, design.final.y)
     gy = 2 * problem.area_weights[:, None] * (error.e @ error.R) / weights.error_scale**2
-    rows, excess = _force_rows(weights, f)
+    beyond = forces_beyond(weights, equilibria.patches, design.median)
     stretch = stretch_excess(problem, weights, design.rho, design.median.x)
-    gx, gf = (stretch.rows.T @ stretch.values).reshape(-1, 3), (rows.T @ excess).reshape(-1, 3)
+    gx, gf = (stretch.rows.T @ stretch.values).reshape(-1, 3), (beyond.rows.T @ beyond.values).reshape(-1, 3)
     g_rho, g_c = lin.adjoint(gx, gf, gy)
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
     metric = shape_metric(problem, design.final.y, weights.error_scale)
     dx_dc, df_dc, dy_dc = lin.held_columns()
     H = dy_dc.T @ metric.apply(dy_dc)
-    for limited in (rows @ df_dc, stretch.rows @ dx_dc):
+    for limited in (beyond.rows @ df_dc, stretch.rows @ dx_dc):
         H += limited.T @ limited
     return Model(
         lin=lin,
@@ -165,24 +165,13 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
         dx_dc=dx_dc,
         df_dc=df_dc,
         dy_dc=dy_dc,
-        force_rows=rows,
+        force_rows=beyond.rows,
         stretch_rows=stretch.rows,
         H_cc=0.5 * (H + H.T),
         terms=terms,
         L=L,
         lam_smooth=weights.lam_smooth,
     )
-
-
-def _force_rows(weights: ObjectiveWeights, forces: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rows (k, 3K) and values (k,) whose squares, halved, sum to the penalty on forces beyond the limit."""
-    excess = force_excess(forces, weights.max_force)
-    active = np.flatnonzero(excess > 0)
-    rows = np.zeros((len(active), forces.size))
-    scale = np.sqrt(2 * weights.limit)
-    for row, p in enumerate(active):
-        rows[row, 3 * p : 3 * p + 3] = scale * forces[p] / (np.linalg.norm(forces[p]) * weights.max_force)
-    return rows, scale * excess[active]
 
 
 def _conjugate_gradients(
@@ -249,7 +238,7 @@ def evaluate(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, de
     """The objective at a design."""
     problem = equilibria.problem
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
-    return objective_value(problem, weights, terms, design.rho, design.median, design.final)
+    return objective_value(equilibria, weights, terms, design.rho, design.median, design.final)
 
 
 def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | None, n_cg: int = 30) -> FloatArray:

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from fab4d.design.equilibria import Final, Median
+from fab4d.design.equilibria import Equilibria, Final, Median
+from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import FloatArray, IntArray
@@ -18,6 +19,7 @@ class ObjectiveWeights:
     lam_round weighs (4/V) sum_j V_j rho_j (1 - rho_j): unlike E_mat it has a slope at 0 and 1, so densities reach them.
 
     max_force : largest force of a patch, in mu_TPE L0^2          smp_, tpe_max_stretch : largest principal stretches
+    pull_only : whether a force may not point into the surface
     limit : weight of the squared relative excess beyond these limits
     """
 
@@ -29,10 +31,16 @@ class ObjectiveWeights:
     max_force: float = np.inf
     smp_max_stretch: float = np.inf
     tpe_max_stretch: float = np.inf
+    pull_only: bool = False
     limit: float = 100.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
-        return replace(self, **changes)
+        """The same with other numbers."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+# A rig that only pulls is asked for this share of the usual force out of the surface: a penalty gives way a little.
+PULL_MARGIN = 0.05
 
 
 def smoothness_matrix(problem: Problem) -> csr_array:
@@ -98,6 +106,39 @@ def shape_metric(problem: Problem, y: FloatArray, error_scale: float) -> ShapeMe
 def force_excess(forces: FloatArray, max_force: float) -> FloatArray:
     """(K,) how far the size of each force is beyond the largest one, relative to it."""
     return np.maximum(np.linalg.norm(forces, axis=1) / max_force - 1.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ForceExcess:
+    """The forces beyond what the rig gives.
+
+    values (k,) : relative excess times sqrt(2 limit), half of whose squares sum to the penalty
+    rows (k, 3K) : their derivatives with respect to the forces, the normals and the usual force held
+    """
+
+    values: FloatArray
+    rows: FloatArray
+
+
+def forces_beyond(weights: ObjectiveWeights, patches: Patches, median: Median) -> ForceExcess:
+    """Forces of the median shape that are too large, or that push where the rig only pulls."""
+    excess, along = force_excess(median.forces, weights.max_force), unit_rows(median.forces) / weights.max_force
+    if weights.pull_only and patches.count:
+        usual = float(np.sqrt((median.forces**2).sum(axis=1).mean())) + 1e-12
+        normals = outward_normals(patches, median.x)
+        pushed = np.maximum(PULL_MARGIN - (median.forces * normals).sum(axis=1) / usual, 0.0)
+        excess, along = np.concatenate([excess, pushed]), np.concatenate([along, -normals / usual])
+    active, scale = np.flatnonzero(excess > 0), np.sqrt(2 * weights.limit)
+    rows = np.zeros((len(active), patches.count, 3))
+    if len(active):
+        rows[np.arange(len(active)), active % patches.count] = scale * along[active]
+    return ForceExcess(scale * excess[active], rows.reshape(len(active), 3 * patches.count))
+
+
+def unit_rows(vectors: FloatArray) -> FloatArray:
+    """Vectors (k, 3) divided by their lengths; zero stays zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(lengths > 0, lengths, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +214,16 @@ def density_terms(weights: ObjectiveWeights, v: FloatArray, L: csr_array, rho: F
 
 
 def objective_value(
-    problem: Problem, weights: ObjectiveWeights, terms: DensityTerms, rho: FloatArray, median: Median, final: Final
+    equilibria: Equilibria,
+    weights: ObjectiveWeights,
+    terms: DensityTerms,
+    rho: FloatArray,
+    median: Median,
+    final: Final,
 ) -> float:
     """The whole objective, each term dimensionless."""
+    problem = equilibria.problem
     error = shape_error(problem, final.y).rms / weights.error_scale
-    forces = weights.limit * float((force_excess(median.forces, weights.max_force) ** 2).sum())
+    forces = 0.5 * float((forces_beyond(weights, equilibria.patches, median).values ** 2).sum())
     stretches = 0.5 * float((stretch_excess(problem, weights, rho, median.x).values ** 2).sum())
     return error**2 + terms.value + forces + stretches

@@ -46,6 +46,12 @@ class Patches:
         return self.operator(n_nodes).T @ forces
 
 
+def outward_normals(patches: Patches, x: FloatArray) -> FloatArray:
+    """(K, 3) unit normals of the patches in the shape x (N, 3), out of the part."""
+    areas = np.add.reduceat(face_area_vectors(x, patches.faces), patches.offsets[:-1])
+    return areas / np.linalg.norm(areas, axis=1, keepdims=True)
+
+
 def build_patches(problem: Problem, centers: IntArray, radius: float) -> Patches:
     """Patches of the given dimensionless radius around boundary vertices outside the clamp.
 

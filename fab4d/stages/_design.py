@@ -43,6 +43,7 @@ def objective_weights(
         lam_SMP=LAM_SMP if weights.lam_SMP is None else weights.lam_SMP,
         lam_mat=0.0 if weights.lam_mat is None else weights.lam_mat,
         lam_smooth=LAM_SMOOTH if weights.lam_smooth is None else weights.lam_smooth,
+        pull_only=rig.pull_only,
         max_force=LIMIT_MARGIN * rig.max_force / problem.force,
         smp_max_stretch=LIMIT_MARGIN * materials.smp_max_stretch,
         tpe_max_stretch=LIMIT_MARGIN * materials.tpe_max_stretch,

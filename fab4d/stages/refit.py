@@ -10,14 +10,14 @@ from fab4d.design.flips import FlipSettings, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import ObjectiveWeights
-from fab4d.design.patches import Patches
+from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import smp_clusters
 from fab4d.fabrication.wellcomposed import flip_check
 from fab4d.io.scene import Goal, PrinterCard
-from fab4d.mesh.measures import face_area_vectors, tet_volumes
+from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
 from fab4d.stages._element import element_for
@@ -142,14 +142,9 @@ def limit_reasons(problem: Problem, patches: Patches, design: Design, profile: M
     if len(sizes) and sizes.max() > rig.max_force * (1 + 1e-3):
         point = int(sizes.argmax())
         reasons.append(f"point {point + 1} needs {sizes[point]:.4g} N, the rig gives {rig.max_force:g} N")
-    if rig.pull_only:
-        pushed = [str(k + 1) for k in range(patches.count) if _pushes(patches, design, k)]
-        if pushed:
-            reasons.append(f"the rig only pulls, but points {', '.join(pushed)} are pushed")
+    if rig.pull_only and patches.count:
+        outward = (forces * outward_normals(patches, design.median.x)).sum(axis=1)
+        if (outward < 0).any():
+            pushed = ", ".join(str(k + 1) for k in np.flatnonzero(outward < 0))
+            reasons.append(f"the rig only pulls, but points {pushed} are pushed")
     return reasons
-
-
-def _pushes(patches: Patches, design: Design, k: int) -> bool:
-    faces = patches.faces[patches.offsets[k] : patches.offsets[k + 1]]
-    outward = face_area_vectors(design.median.x, faces).sum(axis=0)
-    return bool(design.median.forces[k] @ outward < 0)

@@ -7,7 +7,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from fab4d.design.patches import Patches, build_patches, pad_vertices, patches_from_faces, spread_centers
+from fab4d.design.patches import (
+    Patches,
+    build_patches,
+    outward_normals,
+    pad_vertices,
+    patches_from_faces,
+    spread_centers,
+)
 from fab4d.design.problem import Problem
 from fab4d.mesh.measures import face_area_vectors
 
@@ -77,6 +84,15 @@ def test_spreading_does_the_work_of_the_mean_position(problem: Problem, patches:
     x, forces = rng.standard_normal(problem.body.X.shape), rng.standard_normal((patches.count, 3))
     nodal = patches.spread(forces, problem.n_nodes)
     assert float((nodal * x).sum()) == pytest.approx(float((forces * patches.mean(x)).sum()), rel=1e-12)
+
+
+def test_normals_point_out_of_the_part(problem: Problem, patches: Patches) -> None:
+    normals, X = outward_normals(patches, problem.body.X), problem.body.X
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(outward_normals(patches, X @ R.T), normals @ R.T, atol=1e-12)
+    means = patches.mean(X)
+    assert ((means - X.mean(axis=0)) * normals).sum(axis=1).min() > 0
 
 
 def test_patches_leave_the_clamp_alone(problem: Problem, patches: Patches) -> None:

@@ -10,6 +10,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.patches import outward_normals
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import (
     Phase,
@@ -112,6 +113,18 @@ def test_phases_follow_each_other(searched: list[Search]) -> None:
     assert phases[-1] is Phase.DONE
     errors = [rms(at.equilibria.problem, at.design) for at in searched if at.phase is Phase.RELAX]
     assert errors[-1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("pull_only", [False, True])
+def test_a_rig_that_only_pulls_is_asked_to_pull_only(pull_only: bool) -> None:
+    """Where it may, the same scene is pushed at two of its points."""
+    problem = bar(cells=(6, 2, 2), degrees=45.0)
+    weights = ObjectiveWeights(error_scale=5e-3, lam_SMP=0.05, lam_smooth=0.3, pull_only=pull_only)
+    found = solve_reduced(problem, settings_for(problem, n_points=6, weights=weights), lambda at: None)  # noqa: ARG005
+    median = found.design.median
+    outward = (median.forces * outward_normals(found.equilibria.patches, median.x)).sum(axis=1)
+    assert (outward > 0).all() == pull_only
+    assert rms(problem, found.design) < 5e-3
 
 
 def test_the_fewest_points_meet_the_error_and_one_less_does_not() -> None:
