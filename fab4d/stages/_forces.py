@@ -14,10 +14,12 @@ from fab4d.mesh.quadratic import with_midpoints
 from fab4d.mesh.refinement import on_children, refined, refined_faces
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages._design import patches_of, problem_of
-from fab4d.stages._element import MOST_QUADRATIC_DOFS, quadratic_dofs
+from fab4d.stages._element import quadratic_dofs
 
 # Only one equilibrium is solved on the refined mesh, so it may be larger than a mesh to design on.
 MOST_REFINED_DOFS = 200_000
+# A design in linear elements is compared with quadratic ones up to here: beyond, that takes longer than the design.
+MOST_COMPARED_DOFS = 60_000
 # Order with which forces converge on refined meshes of quadratic tets. Smooth states reach 4 (twice that of strains:
 # Strang and Fix, An Analysis of the Finite Element Method, 1973); edges of pads, clamps and materials lower it, to
 # 1.4 on a bar one tet thick.
@@ -27,7 +29,7 @@ ELEMENT_ORDER = 4
 # Of an error estimated from two meshes. Source: Roache, J. Fluids Eng. 116 (1994) 405, the factor of that paper's
 # grid convergence index where the order is known.
 SAFETY = 1.25
-_TOLERANCE, _ITERATIONS = 1e-8, 40
+_TOLERANCE, _ITERATIONS = 1e-8, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ def force_report(
 
 
 def _fits(mesh: Mapping[str, np.ndarray], order: int) -> bool:
-    return order == 2 or quadratic_dofs(mesh) <= MOST_QUADRATIC_DOFS
+    return order == 2 or quadratic_dofs(mesh) <= MOST_COMPARED_DOFS
 
 
 def _refinable(mesh: Mapping[str, np.ndarray]) -> bool:

@@ -117,7 +117,7 @@ def test_force_change_compares_both_elements_at_the_same_positions(cantilever: A
 def test_a_mesh_too_large_to_compare_is_left_out_and_that_is_said(
     cantilever: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_forces, "MOST_QUADRATIC_DOFS", 100)
+    monkeypatch.setattr(_forces, "MOST_COMPARED_DOFS", 100)
     held, arrays = tip_held(cantilever, "linear")
     report = force_report(cantilever, CARD, arrays, held)
     assert report["force_change"] is None
