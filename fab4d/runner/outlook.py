@@ -22,20 +22,20 @@ from fab4d.runner.workspace import Workspace
 # Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
 # A power below zero, noise of the runs, is taken as zero.
 STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (1.23, 0.0),
-    "solve": (6.38, 0.79),
-    "threshold": (0.0688, 0.59),
-    "refit": (1.96, 0.71),
-    "verify": (0.86, 0.89),
-    "sensitivity": (0.6, 0.9),
-    "judge": (0.05, 0.0),
-    "bodies": (0.13, 0.46),
-    "slice": (1.15, 0.61),
-    "rig": (0.535, 0.04),
-    "report": (1.12, 0.0),
+    "check": (1.13, 0.12),
+    "solve": (5.68, 0.83),
+    "threshold": (0.106, 0.72),
+    "refit": (3.05, 0.74),
+    "verify": (1.35, 0.88),
+    "sensitivity": (0.704, 0.88),
+    "judge": (0.0207, 0.34),
+    "bodies": (0.771, 0.21),
+    "slice": (1.22, 0.59),
+    "rig": (0.502, 0.07),
+    "report": (0.381, 0.19),
 }
 # Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (291, 18.8)
+MEMORY_MB = (370, 50.9)
 
 
 def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[str, Any]) -> list[str]:
