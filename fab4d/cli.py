@@ -4,7 +4,7 @@ import re
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -359,6 +359,7 @@ def slice_command(scene: Path, out: Path | None, slicer: str | None, quiet: bool
     with workspace.locked():
         reads = stage_table().stage("slice").reads
         inputs = {name: workspace.load(name) if workspace.exists(name) else None for name in reads}
+        _refuse_missing_files(workspace, inputs)
         report = slice_report(program, inputs)
         workspace.save({"slice_report": report})
     click.echo("\n".join(slice_lines(report)))
@@ -366,6 +367,15 @@ def slice_command(scene: Path, out: Path | None, slicer: str | None, quiet: bool
     if failed:
         msg = f"{program.program}: {failed[0]['check']} differs by {failed[0]['value']:.2%} of the volume"
         raise SliceError(msg)
+
+
+def _refuse_missing_files(workspace: "Workspace", inputs: Mapping[str, Any]) -> None:
+    """Raise ArtifactError for a print file that the bodies' report tells of and that is gone."""
+    needed = ["part_3mf", *(f"{name}_stl" for name in inputs["bodies_report"]["bodies"])]
+    for name in needed:
+        if inputs[name] is None:
+            msg = f"{workspace.path(name)} is missing: make it again with `fab4d bodies SCENE --force`"
+            raise ArtifactError(msg)
 
 
 def _with_bodies(path: Path, out: Path | None, quiet: bool) -> "Workspace":

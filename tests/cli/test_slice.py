@@ -107,3 +107,14 @@ def test_what_is_no_run_is_taken_for_a_scene(mesh: Path, monkeypatch: pytest.Mon
     result = fab4d("slice", mesh.parent)
     assert result.exit_code == 3
     assert "scene.toml" in result.stderr
+
+
+@pytest.mark.parametrize("gone", ["part.3mf", "smp.stl"])
+def test_a_print_file_that_is_gone_is_named(mesh: Path, monkeypatch: pytest.MonkeyPatch, gone: str) -> None:
+    fab4d("bodies", mesh, "--labels", "material", "--units", "cm")
+    lay_down(monkeypatch, 2000, 2000)
+    assert fab4d("slice", "runs/bar-bodies").exit_code == 0
+    (Path("runs/bar-bodies/print") / gone).unlink()
+    result = fab4d("slice", "runs/bar-bodies")
+    assert result.exit_code == 8
+    assert f"{gone} is missing: make it again" in result.stderr
