@@ -165,7 +165,7 @@ def _power(value: float | None) -> str:
 def _checks(checks: Sequence[Check]) -> str:
     rows = "".join(
         f'<tr class="{_outcome(c)}"><td>{escape(c.name)}</td><td>{escape(c.found)}</td>'
-        f"<td>{escape(c.allowed)}</td><td>{_outcome(c)}</td></tr>"
+        f'<td>{escape(c.allowed)}</td><td class="outcome">{_outcome(c)}</td></tr>'
         for c in checks
     )
     return f"<table><tr><th>what</th><th>found</th><th>allowed</th><th></th></tr>{rows}</table>"
