@@ -200,11 +200,12 @@ class Equilibria:
         tolerance: float = 1e-9,
         max_iterations: int = 25,
         extra: FloatArray | None = None,
+        stay: bool = False,
     ) -> Median:
         """Median shape with the patch means at `held` (K, 3), from the guess x, forces.
 
-        extra : (N, 3) additional nodal forces on the part, for load paths. The tolerance is relative to the largest
-        nodal element force.
+        extra : (N, 3) additional nodal forces on the part, for load paths        stay : see `newton`
+        The tolerance is relative to the largest nodal element force.
         """
         n, shape = 3 * self.problem.n_nodes, x.shape
         fixed = self.held_mask.fixed
@@ -232,7 +233,9 @@ class Equilibria:
             return np.concatenate([ahead.ravel(), z[n:] + step[n:]])
 
         z = np.concatenate([x.ravel(), forces.ravel()])
-        solution = newton(residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count, advance)
+        solution = newton(
+            residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count, advance, stay
+        )
         x = solution.z[:n].reshape(shape)
         gradients = np.zeros_like(self.problem.body.dN)
         kernels.deformed_gradients(self.problem.body.elements, self.problem.body.dN, x - self.problem.body.X, gradients)
@@ -283,11 +286,13 @@ class Equilibria:
         tolerance: float = 1e-9,
         max_iterations: int = 25,
         unloaded: float = 1.0,
+        stay: bool = False,
     ) -> Final:
         """Final shape after unloading, from the guess y.
 
         tolerance : relative to the TPE's pull at the median shape
-        unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape.
+        unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape
+        stay : see `newton`
         """
         shape, body, tpe = y.shape, self.problem.body, self.problem.tpe
         pull = np.zeros_like(y)
@@ -314,5 +319,5 @@ class Equilibria:
         def fallback(z: FloatArray) -> Factor:
             return pinned(z, True)
 
-        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0, advance)
+        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0, advance, stay)
         return Final(solution.z.reshape(shape), solution)

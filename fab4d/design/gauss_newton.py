@@ -44,12 +44,13 @@ def equilibrate(
     y: FloatArray,
     tolerance: float = SEARCH_TOLERANCE,
     max_iterations: int = 12,
+    stay: bool = False,
 ) -> Design | None:
     """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found."""
-    median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations)
+    median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay)
     if not median.solution.converged:
         return None
-    final = equilibria.solve_final(rho, median, y, tolerance, max_iterations)
+    final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay)
     return Design(rho, median, final) if final.solution.converged else None
 
 
@@ -58,6 +59,9 @@ TRIAL_ITERATIONS = 8
 LARGEST_MOVE = 0.1
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
 HELD_STEP = 0.05
+# So may the nodes of the median shape in the root mean square: where that is nearly unstable, small changes of density
+# and held positions move it far along a soft mode, and its linear prediction is of no use there.
+MEDIAN_STEP = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,7 @@ class Model:
     force_rows: FloatArray
     stretch_rows: csr_array
     H_cc: FloatArray
+    moved_cc: FloatArray
     terms: DensityTerms
     L: csr_array
     lam_smooth: float
@@ -88,16 +93,18 @@ class Model:
     def damped(self, damping: float, volume_fractions: FloatArray) -> "DampedModel":
         """The model with Levenberg-Marquardt terms that hold back density and held positions alike."""
         k = len(self.H_cc)
-        held = self.H_cc + 2 * (damping + 1e-9) / (max(k, 1) * HELD_STEP**2) * np.eye(k)
-        return DampedModel(self, damping * volume_fractions, cho_factor(held) if k else None)
+        moves = 6 * damping / (len(self.dx_dc) * MEDIAN_STEP**2)
+        held = self.H_cc + 2 * (damping + 1e-9) / (max(k, 1) * HELD_STEP**2) * np.eye(k) + moves * self.moved_cc
+        return DampedModel(self, damping * volume_fractions, moves, cho_factor(held) if k else None)
 
 
 @dataclass(frozen=True, eq=False)
 class DampedModel:
-    """A model, its damping of the density (m,), and the factored, damped H_cc."""
+    """A model, its damping of density (m,) and median shape, and the factored, damped H_cc."""
 
     model: Model
     damping: FloatArray
+    moves: float
     held_factor: tuple | None
 
     def _held(self, rhs: FloatArray) -> FloatArray:
@@ -106,7 +113,8 @@ class DampedModel:
     def _pull_back(self, change: Change) -> Change:
         """Gradients of the quadratic terms with respect to x, f and y at a change of these."""
         rows, stretch = self.model.force_rows, self.model.stretch_rows
-        return Change(stretch.T @ (stretch @ change.x), rows.T @ (rows @ change.f), self.model.metric.apply(change.y))
+        gx = stretch.T @ (stretch @ change.x) + self.moves * change.x
+        return Change(gx, rows.T @ (rows @ change.f), self.model.metric.apply(change.y))
 
     def _onto_held(self, g: Change) -> FloatArray:
         m = self.model
@@ -168,6 +176,7 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
         force_rows=beyond.rows,
         stretch_rows=stretch.rows,
         H_cc=0.5 * (H + H.T),
+        moved_cc=dx_dc.T @ dx_dc,
         terms=terms,
         L=L,
         lam_smooth=weights.lam_smooth,
@@ -270,7 +279,7 @@ def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArra
     median, y = design.median, design.final.y
     rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
     x0, y0 = equilibria.held_turning.step(median.x, dx), equilibria.free_turning.step(y, dy)
-    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=TRIAL_ITERATIONS)
+    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=TRIAL_ITERATIONS, stay=True)
 
 
 def held_positions(equilibria: Equilibria, median: Median) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.solvers.linear import Factor, SingularMatrixError
+from fab4d.solvers.negative_modes import descending
 
 
 class Status(Enum):
@@ -17,6 +18,7 @@ class Status(Enum):
     MAX_ITERATIONS = "the residual is still above the tolerance after the most iterations"
     NO_STEP = "no step along the Newton direction lowers the residual inside the domain"
     SINGULAR = "the tangent is singular"
+    UNSTABLE = "the way leads past unstable states"
 
 
 MAX_HALVINGS = 20
@@ -61,12 +63,16 @@ def newton(
     fallback: Callable[[FloatArray], Factor] | None = None,
     n_negative: int = 0,
     advance: Callable[[FloatArray, FloatArray], FloatArray] = np.add,
+    stay: bool = False,
 ) -> Solution:
     """Solve residual(z) = 0, the stationary point of a potential.
 
-    factor, fallback : z -> factor of the tangent; `fallback` is used where `factor` has more than `n_negative` negative
-        eigenvalues, and must have `n_negative`
+    factor, fallback : z -> factor of the tangent. Where `factor` has more than `n_negative` negative eigenvalues, the
+        step is reversed along their modes; where those are many or not found, it comes from `fallback`, which must have
+        `n_negative`. These belong to the last n_negative unknowns, the multipliers of constraints.
     advance : z, step -> z after the step; differs from z + step in second order only
+    stay : give up where the tangent has other negative eigenvalues than it should after the first step: the stationary
+        point that is found beyond is none near z
     A step is halved until the residual or the potential falls; halvings because of the domain count as guarded.
     """
     at, guarded = residual(z), 0
@@ -74,9 +80,11 @@ def newton(
         if at.norm <= tolerance * at.scale:
             return Solution(z, Status.CONVERGED, at.norm / at.scale, iteration, guarded)
         try:
-            step = -_usable(factor, fallback, z, n_negative).solve(at.r)
+            step = _step(factor, fallback, z, at.r, n_negative, stay and iteration > 0)
         except SingularMatrixError:
             return Solution(z, Status.SINGULAR, at.norm / at.scale, iteration, guarded)
+        if step is None:
+            return Solution(z, Status.UNSTABLE, at.norm / at.scale, iteration, guarded)
         t, slope = 1.0, float(at.r @ step)
         for _ in range(MAX_HALVINGS):
             ahead = advance(z, t * step)
@@ -92,20 +100,30 @@ def newton(
     return Solution(z, status, at.norm / at.scale, max_iterations, guarded)
 
 
-def _usable(
+def _step(
     factor: Callable[[FloatArray], Factor],
     fallback: Callable[[FloatArray], Factor] | None,
     z: FloatArray,
+    r: FloatArray,
     n_negative: int,
-) -> Factor:
-    """The factor at z, or the fallback where it has other negative eigenvalues than it should, or is singular."""
-    if fallback is None:
-        return factor(z)
+    stay: bool,
+) -> FloatArray | None:
+    """Newton's step at z, changed where the tangent is singular or has more negative eigenvalues than it should.
+
+    None where it has, to stay.
+    """
     try:
         tangent = factor(z)
     except SingularMatrixError:
-        return fallback(z)
-    return fallback(z) if tangent.n_negative > n_negative else tangent
+        if fallback is None or stay:
+            raise
+        return -fallback(z).solve(r)
+    if fallback is None or tangent.n_negative <= n_negative:
+        return -tangent.solve(r)
+    if stay:
+        return None
+    turned = descending(tangent, -tangent.solve(r), len(z) - n_negative, tangent.n_negative - n_negative)
+    return -fallback(z).solve(r) if turned is None else turned
 
 
 def _improves(new: Residual, old: Residual, t: float, slope: float, tolerance: float) -> bool:

@@ -1,0 +1,77 @@
+"""Newton away from saddle points: a chain of double wells, whose minima are known."""
+
+import numpy as np
+import pytest
+
+from fab4d.solvers.linear import Factor, analyse
+from fab4d.solvers.negative_modes import descending
+from fab4d.solvers.newton import Residual, Status, newton
+
+N = 40
+STIFFNESS = 300.0
+INDPTR = np.r_[np.arange(0, 2 * N, 2), 2 * N - 1]
+INDICES = np.column_stack([np.arange(N), np.arange(1, N + 1)]).ravel()[: 2 * N - 1]
+
+
+def wells(z: np.ndarray) -> Residual:
+    """Springs between neighbours and a double well with minima -1 and 1 at each: E = 0 there, N/4 on the saddle 0."""
+    stretch = STIFFNESS * np.diff(z)
+    r = z**3 - z
+    r[1:] += stretch
+    r[:-1] -= stretch
+    return Residual(r, 1.0, float((stretch**2).sum() / (2 * STIFFNESS) + ((z**2 - 1) ** 2).sum() / 4))
+
+
+def tangent(z: np.ndarray) -> Factor:
+    data = np.zeros(2 * N - 1)
+    data[::2] = 3 * z**2 - 1 + STIFFNESS * np.r_[1.0, np.full(N - 2, 2.0), 1.0]
+    data[1::2] = -STIFFNESS
+    return analyse(INDPTR, INDICES).factor(data)
+
+
+def no_fallback(z: np.ndarray) -> Factor:
+    raise AssertionError(z)
+
+
+@pytest.fixture
+def near_saddle() -> np.ndarray:
+    """Close to the saddle: an undulation that the springs flatten, and a little of the one unstable mode."""
+    return 0.02 * np.cos(np.arange(N)) + 1e-3
+
+
+def test_leaves_a_saddle_for_the_minimum(near_saddle):
+    assert tangent(near_saddle).n_negative == 1
+    found = newton(wells, tangent, near_saddle, 1e-10, 20, no_fallback)
+    assert found.converged
+    assert np.allclose(found.z, 1.0)
+    assert found.iterations <= 15
+
+
+def test_ends_on_the_saddle_without_a_fallback(near_saddle):
+    found = newton(wells, tangent, near_saddle, 1e-10, 20)
+    assert found.converged
+    assert np.allclose(found.z, 0.0, atol=1e-8)
+
+
+def test_stays_where_it_is_when_told_to(near_saddle):
+    found = newton(wells, tangent, near_saddle, 1e-10, 20, no_fallback, stay=True)
+    assert found.status is Status.UNSTABLE
+    assert found.iterations == 1
+
+
+def test_a_stable_state_is_found_when_staying():
+    found = newton(wells, tangent, np.full(N, 0.9), 1e-10, 20, no_fallback, stay=True)
+    assert found.converged
+    assert np.allclose(found.z, 1.0)
+
+
+def test_the_step_is_reversed_along_the_unstable_mode_alone(near_saddle):
+    factor, load = tangent(np.zeros(N)), wells(near_saddle).r
+    step = -factor.solve(load)
+    mode = np.full(N, 1 / np.sqrt(N))
+    expected = step - 2 * (mode @ step) * mode
+    assert np.allclose(descending(factor, step, N, 1), expected, rtol=1e-3, atol=1e-8)
+
+
+def test_many_negative_modes_are_left_to_the_fallback():
+    assert descending(tangent(np.zeros(N)), np.ones(N), N, N) is None
