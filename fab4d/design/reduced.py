@@ -303,7 +303,7 @@ def refit(
         step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed, tries=12)
         if not step.accepted:
             break
-        slow = step.value > (1 - 1e-3) * value
+        slow = step.value > (1 - 1e-2) * value
         design, damping, value = step.design, step.damping, step.value
         watch(Search(equilibria, design, Phase.DONE))
         if slow:

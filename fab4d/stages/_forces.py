@@ -17,7 +17,7 @@ from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages._element import quadratic_dofs
 
 # Only one equilibrium is solved on the refined mesh, so it may be larger than a mesh to design on.
-MOST_REFINED_DOFS = 200_000
+MOST_REFINED_DOFS = 100_000
 # A design in linear elements is compared with quadratic ones up to here: beyond, that takes longer than the design.
 MOST_COMPARED_DOFS = 60_000
 # Order with which forces converge on refined meshes of quadratic tets. Smooth states reach 4 (twice that of strains:
