@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.exchange import exchanged
 from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, gauss_newton_step, held_positions
-from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
+from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
@@ -34,10 +34,10 @@ FIRST_COUNT = 4
 
 @dataclass(frozen=True)
 class ReducedSettings:
-    """Number and radius (L0) of the patches, the objective, and how long each phase may go on."""
+    """Number of the patches and the radii (L0) to choose from, the objective, and how long each phase may go on."""
 
     n_points: int
-    patch_radius: float
+    patch_radii: tuple[float, ...]
     weights: ObjectiveWeights
     max_smp_fraction: float = 1.0
     relax_iterations: int = 15
@@ -58,13 +58,15 @@ class Phase(Enum):
 class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
-    phase : of the next step        iteration, slow : steps of this phase, and how many of the last gained little
+    patch_radius : L0        phase : of the next step
+    iteration, slow : steps of this phase, and how many of the last gained little
     exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
     """
 
     equilibria: Equilibria
     design: Design
+    patch_radius: float = 0.0
     phase: Phase = Phase.RELAX
     lam_SMP: float = 0.0
     lam_round: float = 0.0
@@ -88,7 +90,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     L = smoothness_matrix(problem)
     at = start
     if at is None:
-        at = Search(*first_design(problem, settings), lam_SMP=settings.weights.lam_SMP)
+        at = first_search(problem, settings)
         watch(at)
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
@@ -102,7 +104,7 @@ def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch) -> Search
     Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
     """
     L = smoothness_matrix(problem)
-    at = Search(*first_design(problem, settings), lam_SMP=settings.weights.lam_SMP)
+    at = first_search(problem, settings)
     while at.phase in (Phase.RELAX, Phase.EXCHANGE):
         watch(at)
         at = STEPS[at.phase](at, settings, L)
@@ -137,20 +139,40 @@ def fewest_points(problem: Problem, settings: ReducedSettings, enough: float, wa
 # -- start
 
 
-def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibria, Design]:
+def first_search(problem: Problem, settings: ReducedSettings) -> Search:
     """The points held where the wanted shape has them, everything else relaxed from X_temp.
 
-    When that fails, four times as many points are held first, then those are let go.
+    With the smallest patches whose pull stretches no material too far, or else the largest. Raises EquilibriumError
+    when no equilibrium near X_temp is found with so few patches.
     """
     if not problem.clamp.any() and settings.n_points < FEWEST_FREE_POINTS:
         msg = f"a part without a clamp needs {FEWEST_FREE_POINTS} points at least: give one or raise [goal] max_forces"
         raise EquilibriumError(msg)
     rho = np.full(problem.n_tets, START_DENSITY)
     x = np.where(problem.clamp[:, None], problem.body.X, problem.X_temp)
-    equilibria = Equilibria(problem, spread_patches(problem, settings.n_points, settings.patch_radius))
+    for radius in settings.patch_radii:
+        equilibria, median = _held_at_target(problem, settings.n_points, radius, rho, x)
+        x = median.x
+        if not len(stretch_excess(problem, settings.weights, rho, x).tets):
+            break
+    final = equilibria.solve_final(rho, median, median.x, max_iterations=100)
+    if not final.solution.converged:
+        msg = f"the first design finds no final shape ({final.solution.status.value}): check the temporary shape"
+        raise EquilibriumError(msg)
+    return Search(equilibria, Design(rho, median, final), radius, lam_SMP=settings.weights.lam_SMP)
+
+
+def _held_at_target(
+    problem: Problem, count: int, radius: float, rho: FloatArray, x: FloatArray
+) -> tuple[Equilibria, Median]:
+    """`count` patches where X_temp has them and the median shape reached from x.
+
+    When that fails, four times as many are held first, then those are let go.
+    """
+    equilibria = Equilibria(problem, spread_patches(problem, count, radius))
     median = _relaxed(equilibria, rho, x)
     if not median.solution.converged:
-        dense = equilibria.with_patches(spread_patches(problem, 4 * settings.n_points, settings.patch_radius))
+        dense = equilibria.with_patches(spread_patches(problem, 4 * count, radius))
         median = _relaxed(equilibria, rho, _relaxed(dense, rho, x).x)
     if not median.solution.converged:
         msg = (
@@ -158,11 +180,7 @@ def first_design(problem: Problem, settings: ReducedSettings) -> tuple[Equilibri
             f"({median.solution.status.value}): allow more points ([goal] max_forces)"
         )
         raise EquilibriumError(msg)
-    final = equilibria.solve_final(rho, median, median.x, max_iterations=100)
-    if not final.solution.converged:
-        msg = f"the first design finds no final shape ({final.solution.status.value}): check the temporary shape"
-        raise EquilibriumError(msg)
-    return equilibria, Design(rho, median, final)
+    return equilibria, median
 
 
 def at_rest(problem: Problem) -> Search:
@@ -171,13 +189,14 @@ def at_rest(problem: Problem) -> Search:
     rho, X = np.zeros(problem.n_tets), problem.body.X
     median = equilibria.solve_median(rho, np.zeros((0, 3)), X, np.zeros((0, 3)))
     design = Design(rho, median, equilibria.solve_final(rho, median, X))
-    return Search(equilibria, design, Phase.DONE)
+    return Search(equilibria, design, phase=Phase.DONE)
 
 
 def _relaxed(equilibria: Equilibria, rho: FloatArray, x: FloatArray) -> Median:
-    """The median shape reached from x with the patches held where x has them."""
+    """The median shape reached from x with the patches held where X_temp has them."""
     patches = equilibria.patches
-    return equilibria.solve_median(rho, patches.mean(x), x, np.zeros((patches.count, 3)), max_iterations=100)
+    held = patches.mean(equilibria.problem.X_temp)
+    return equilibria.solve_median(rho, held, x, np.zeros((patches.count, 3)), max_iterations=100)
 
 
 def spread_patches(problem: Problem, count: int, radius: float) -> Patches:
@@ -211,7 +230,7 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
     if shape_error(at.equilibria.problem, at.design.final.y).rms <= GOOD_ENOUGH * weights.error_scale:
         return done
     model = build_model(at.equilibria, weights, L, at.design)
-    found = exchanged(at.equilibria, weights, model, at.design, settings.patch_radius)
+    found = exchanged(at.equilibria, weights, model, at.design, at.patch_radius)
     if found is None:
         return done
     equilibria, design = found
@@ -305,7 +324,7 @@ def refit(
             break
         slow = step.value > (1 - 1e-2) * value
         design, damping, value = step.design, step.damping, step.value
-        watch(Search(equilibria, design, Phase.DONE))
+        watch(Search(equilibria, design, phase=Phase.DONE))
         if slow:
             break
     return design

@@ -7,7 +7,7 @@ import numpy as np
 
 from fab4d.design.objective import smoothness_matrix
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import FIRST_DAMPING, STEPS, Phase, ReducedSettings, Search, Watch, solve_reduced
+from fab4d.design.reduced import STEPS, Phase, ReducedSettings, Search, Watch, solve_reduced
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # Rounding is a jump: one price too high may be bad luck, two in a row are not.
@@ -36,9 +36,7 @@ def relaxed_at(problem: Problem, settings: ReducedSettings, start: Search, lam_S
 
 def repriced(start: Search, lam_SMP: float) -> Search:
     """The design of `start`, about to be relaxed at another price of SMP."""
-    return Search(
-        start.equilibria, start.design, Phase.RELAX, lam_SMP, damping=FIRST_DAMPING, exchanges=start.exchanges
-    )
+    return Search(start.equilibria, start.design, start.patch_radius, lam_SMP=lam_SMP, exchanges=start.exchanges)
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,15 @@ class RigCard:
     patch_radius: float
     pull_only: bool
     source: str
+    larger_patch_radii: tuple[float, ...] = ()
+    """Of the other pads it has, for parts that the usual ones stretch too far."""
     max_travel: float | None = None
     """How far it moves a point, mm; None where the card does not tell."""
+
+    @property
+    def patch_radii(self) -> tuple[float, ...]:
+        """Of all its pads, the usual ones first, then by size."""
+        return self.patch_radius, *sorted(self.larger_patch_radii)
 
 
 _MODULI = {"mu_MPa": Key(positive, required=True), "kappa_MPa": Key(positive, required=True)}
@@ -94,6 +101,7 @@ _RIG = {
     "max_points": Key(whole(1), required=True),
     "max_force_N": Key(positive, required=True),
     "patch_radius_mm": Key(positive, required=True),
+    "larger_patch_radii_mm": Key(list_of(positive)),
     "pull_only": Key(flag, required=True),
     "max_travel_mm": Key(positive),
 }

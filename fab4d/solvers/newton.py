@@ -22,6 +22,8 @@ class Status(Enum):
 
 
 MAX_HALVINGS = 20
+# A guess may be unstable where the equilibrium near it is not. From this iteration on, an unstable state leads away.
+ASTRAY = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,7 @@ def newton(
         step is reversed along their modes; where those are many or not found, it comes from `fallback`, which must have
         `n_negative`. These belong to the last n_negative unknowns, the multipliers of constraints.
     advance : z, step -> z after the step; differs from z + step in second order only
-    stay : give up where the tangent has other negative eigenvalues than it should after the first step: the stationary
+    stay : give up where the tangent has other negative eigenvalues than it should after the first steps: the stationary
         point that is found beyond is none near z
     A step is halved until the residual or the potential falls; halvings because of the domain count as guarded.
     """
@@ -80,7 +82,7 @@ def newton(
         if at.norm <= tolerance * at.scale:
             return Solution(z, Status.CONVERGED, at.norm / at.scale, iteration, guarded)
         try:
-            step = _step(factor, fallback, z, at.r, n_negative, stay and iteration > 0)
+            step = _step(factor, fallback, z, at.r, n_negative, stay and iteration >= ASTRAY)
         except SingularMatrixError:
             return Solution(z, Status.SINGULAR, at.norm / at.scale, iteration, guarded)
         if step is None:

@@ -54,7 +54,7 @@ class _Bisection:
     def tried(self, first: Search) -> list[_Tried]:
         """All trials, beginning with the design `first`; those of an interrupted run are taken from it."""
         saved = self.monitor.restore(RELAXED)
-        relaxed = first if saved is None else search_from(self.problem, self.profile["rig"], saved)
+        relaxed = first if saved is None else search_from(self.problem, saved)
         tried = [self.judged(relaxed, first, self.settings.weights.error_scale)]
         while (price := next_price([done.trial for done in tried])) is not None:
             name = f"trial-{len(tried)}"
@@ -79,7 +79,7 @@ class _Bisection:
     def recalled(self, kept: Mapping[str, np.ndarray]) -> _Tried:
         self.trace.go_on(kept["trace"].tobytes())
         lam_SMP, smp_fraction, acceptable, rms = kept["trial"].tolist()
-        relaxed, found = (search_from(self.problem, self.profile["rig"], _part(kept, part)) for part in _STATES)
+        relaxed, found = (search_from(self.problem, _part(kept, part)) for part in _STATES)
         trial = Trial(lam_SMP, smp_fraction, bool(acceptable))
         return _Tried(trial, relaxed, found, rms, tuple(kept["faults"].tolist()))
 

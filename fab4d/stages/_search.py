@@ -10,9 +10,8 @@ from fab4d.design.patches import build_patches
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
-from fab4d.io.scene import RigCard
 
-_NUMBERS = ("lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms")
+_NUMBERS = ("patch_radius", "lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms")
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:
@@ -29,17 +28,17 @@ def search_arrays(at: Search) -> dict[str, np.ndarray]:
     }
 
 
-def search_from(problem: Problem, rig: RigCard, saved: Mapping[str, np.ndarray]) -> Search:
+def search_from(problem: Problem, saved: Mapping[str, np.ndarray]) -> Search:
     """The state that `search_arrays` saved; its shapes are in equilibrium as they are.
 
     Raises ArtifactError when they are not.
     """
-    equilibria = Equilibria(problem, build_patches(problem, saved["centers"], rig.patch_radius / problem.length))
+    numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
+    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")}
+    equilibria = Equilibria(problem, build_patches(problem, saved["centers"], numbers["patch_radius"]))
     held = equilibria.patches.mean(saved["x"]) + RIG_COMPLIANCE * saved["forces"]
     design = equilibrate(equilibria, saved["rho"], held, saved["x"], saved["forces"], saved["y"])
     if design is None:
         msg = "a saved state of the solver is not in equilibrium: run again with --force"
         raise ArtifactError(msg)
-    numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
-    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")}
-    return Search(equilibria, design, Phase(str(saved["phase"])), **numbers)
+    return Search(equilibria, design, phase=Phase(str(saved["phase"])), **numbers)

@@ -47,7 +47,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         ]
         return _artifacts(problem, rest, trace, {"tau_s": tau_s, "left_out": why})
     if inputs["picked"] is not None:
-        return _picked(problem, profile["rig"], inputs["picked"], trace, tau_s)
+        return _picked(problem, inputs["picked"], trace, tau_s)
     found, attempts, rms = _search(problem, mesh, profile, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
@@ -67,11 +67,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     return _artifacts(problem, found, trace, report)
 
 
-def _picked(
-    problem: Problem, rig: RigCard, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float
-) -> dict[str, Any]:
+def _picked(problem: Problem, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float) -> dict[str, Any]:
     """The design of a row of the tradeoff, as if it had been searched."""
-    row, found = json.loads(str(picked["row"])), search_from(problem, rig, picked)
+    row, found = json.loads(str(picked["row"])), search_from(problem, picked)
     trace.add("picked", found)
     left_out = [{"what": "search for a design", "why": f"row {row['id']} of the tradeoff is picked"}]
     return _artifacts(problem, found, trace, {"tau_s": tau_s, "picked": row, "left_out": left_out})
@@ -92,8 +90,8 @@ def _search(
     problem: Problem, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], trace: Trace, monitor: Monitor
 ) -> tuple[Search, int, float]:
     """The best design of the attempts made, how many were made, and its RMS error as printed, in L0."""
-    first, start = _resumed(problem, profile, trace, monitor)
-    best, least = _restored_best(problem, profile, monitor)
+    first, start = _resumed(problem, trace, monitor)
+    best, least = _restored_best(problem, monitor)
     count = _points(problem, profile, trace, monitor)
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
@@ -190,7 +188,7 @@ def search_settings(
     smooth, smp = ATTEMPTS[attempt]
     return ReducedSettings(
         n_points=most_points(goal, rig) if n_points is None else n_points,
-        patch_radius=rig.patch_radius / problem.length,
+        patch_radii=tuple(radius / problem.length for radius in rig.patch_radii),
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )
@@ -216,15 +214,15 @@ def _checkpoint(attempt: int, at: Search, trace: Trace) -> dict[str, np.ndarray]
     return search_arrays(at) | numbers
 
 
-def _resumed(problem: Problem, profile: Mapping[str, Any], trace: Trace, monitor: Monitor) -> tuple[int, Search | None]:
+def _resumed(problem: Problem, trace: Trace, monitor: Monitor) -> tuple[int, Search | None]:
     """The attempt and state of a run that was stopped, or the first and None; the trace goes on from there."""
     saved = monitor.restore(CHECKPOINT)
     if saved is None:
         return 0, None
     trace.go_on(saved["trace"].tobytes())
-    return int(saved["attempt"]), search_from(problem, profile["rig"], saved)
+    return int(saved["attempt"]), search_from(problem, saved)
 
 
-def _restored_best(problem: Problem, profile: Mapping[str, Any], monitor: Monitor) -> tuple[Search | None, float]:
+def _restored_best(problem: Problem, monitor: Monitor) -> tuple[Search | None, float]:
     saved = monitor.restore(BEST)
-    return (None, np.inf) if saved is None else (search_from(problem, profile["rig"], saved), float(saved["rms"]))
+    return (None, np.inf) if saved is None else (search_from(problem, saved), float(saved["rms"]))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import ReducedSettings, Search, Watch, first_design, solve_reduced
+from fab4d.design.reduced import ReducedSettings, Search, Watch, first_search, solve_reduced
 from fab4d.design.tradeoff import relaxed_at, way_to
 from fab4d.errors import EquilibriumError, SceneError
 from fab4d.report.metrics import mass_and_cost
@@ -124,11 +124,11 @@ class _Study:
             name = f"relaxed-{_name(settings.n_points, way)}"
             kept = self.monitor.restore(name)
             if kept is None:
-                start = at or Search(*first_design(self.problem, settings))
+                start = at or first_search(self.problem, settings)
                 at = relaxed_at(self.problem, settings, start, way * settings.weights.lam_SMP, watch)
                 self.monitor.save(name, search_arrays(at))
             else:
-                at = search_from(self.problem, self.profile["rig"], kept)
+                at = search_from(self.problem, kept)
         assert at is not None  # every way has a beginning
         return at
 

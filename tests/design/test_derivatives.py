@@ -146,7 +146,9 @@ def test_smoothness_sums_squared_jumps_over_interior_faces() -> None:
 # -- the Gauss-Newton Hessian
 
 
-def dense_schur(moved: Moved, weights: ObjectiveWeights, damping: float, held_damping: np.ndarray) -> np.ndarray:
+def dense_schur(
+    moved: Moved, weights: ObjectiveWeights, damping: float, moves: float, held_damping: np.ndarray
+) -> np.ndarray:
     """H_rr - H_rc H_cc^-1 H_cr from explicit Jacobians and an explicit projection along the rigid modes."""
     equilibria, at = moved.equilibria, moved.at
     problem, m, k = equilibria.problem, len(at.rho), at.median.forces.size
@@ -161,7 +163,7 @@ def dense_schur(moved: Moved, weights: ObjectiveWeights, damping: float, held_da
     modes = np.array([*(np.tile(e, len(y)) for e in np.eye(3)), *(np.cross(e, y).ravel() for e in np.eye(3))]).T
     W = np.diag(2 * np.repeat(a, 3) / weights.error_scale**2)
     P = np.eye(y.size) - modes @ np.linalg.solve(modes.T @ W @ modes, modes.T @ W)
-    blocks = (P @ Jy).T @ W @ (P @ Jy)
+    blocks = (P @ Jy).T @ W @ (P @ Jy) + moves * Jx.T @ Jx
     for rows, J in ((model.force_rows, Jf), (model.stretch_rows.toarray(), Jx)):
         blocks += (rows @ J).T @ (rows @ J)
     density = np.diag(model.terms.curvature + damping * problem.volume_fractions)
@@ -184,9 +186,9 @@ def test_hessian_is_the_schur_complement_of_the_gauss_newton_matrix(moved: Moved
     assert np.linalg.eigvalsh(0.5 * (H + H.T)).min() > 0
     factor, lower = damped.held_factor
     assert not lower
-    held_damping = np.triu(factor).T @ np.triu(factor) - model.H_cc
+    held_damping = np.triu(factor).T @ np.triu(factor) - model.H_cc - damped.moves * model.moved_cc
     assert np.linalg.eigvalsh(held_damping).min() > 0
-    dense = dense_schur(moved, weights, damping, held_damping)
+    dense = dense_schur(moved, weights, damping, damped.moves, held_damping)
     np.testing.assert_allclose(H, dense, atol=1e-9 * np.abs(dense).max())
 
 
@@ -212,10 +214,10 @@ def test_held_step_and_reduced_gradient_solve_the_whole_system(moved: Moved) -> 
     pull = (
         model.dy_dc.T @ model.metric.apply(change[2].ravel())
         + model.df_dc.T @ (model.force_rows.T @ rows)
-        + model.dx_dc.T @ (model.stretch_rows.T @ stretched)
+        + model.dx_dc.T @ (model.stretch_rows.T @ stretched + damped.moves * change[0].ravel())
     )
     factor, lower = damped.held_factor
     assert not lower
-    held_damping = np.triu(factor).T @ np.triu(factor) - model.H_cc
+    held_damping = np.triu(factor).T @ np.triu(factor) - model.H_cc - damped.moves * model.moved_cc
     slope = model.gradient_c + pull + held_damping @ dc.ravel()
     assert np.abs(slope).max() < 1e-9 * np.abs(model.gradient_c).max()

@@ -82,8 +82,8 @@ def test_the_step_keeps_an_exchange_only_where_the_objective_falls(bent: tuple[E
     equilibria, design = bent
     problem = equilibria.problem
     L = smoothness_matrix(problem)
-    settings = ReducedSettings(2, RADIUS, WEIGHTS)
-    start = Search(equilibria, design, Phase.EXCHANGE)
+    settings = ReducedSettings(2, (RADIUS,), WEIGHTS)
+    start = Search(equilibria, design, RADIUS, Phase.EXCHANGE)
     end = exchange_step(start, settings, L)
     before, after = (shape_error(problem, s.design.final.y).rms for s in (start, end))
     assert end.phase is Phase.RELAX

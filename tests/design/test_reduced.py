@@ -54,7 +54,7 @@ def truth() -> Truth:
 
 
 def settings_for(problem: Problem, **changes: object) -> ReducedSettings:
-    settings = ReducedSettings(n_points=4, patch_radius=6.0 / problem.length, weights=WEIGHTS)
+    settings = ReducedSettings(n_points=4, patch_radii=(6.0 / problem.length,), weights=WEIGHTS)
     return replace(settings, **changes)  # type: ignore[arg-type]
 
 

@@ -97,7 +97,7 @@ def test_the_pareto_front_is_what_nothing_beats(designs: list[tuple[int, int]]) 
 def test_dearer_smp_is_used_less_and_the_way_there_is_short() -> None:
     problem = bar(degrees=30.0)
     weights = ObjectiveWeights(error_scale=3e-3, lam_SMP=0.05, lam_smooth=0.3)
-    settings = ReducedSettings(4, 6.0 / problem.length, weights)
+    settings = ReducedSettings(4, (6.0 / problem.length,), weights)
     first: list[Search] = []
     start = relaxed(problem, settings, first.append)
     states: list[Search] = []
