@@ -13,7 +13,7 @@ from fab4d.mesh.interpolation import shape_path
 from fab4d.mesh.tetmesh import FloatArray
 
 FIRST_LOAD, FIRST_UNLOAD, SMALLEST_STEP = 0.05, 0.25, 1e-3
-PATH_TOLERANCE, END_TOLERANCE = 1e-4, 1e-11
+PATH_TOLERANCE, END_TOLERANCE = 1e-4, 1e-12
 PATH_ITERATIONS, END_ITERATIONS = 12, 10
 # A load step that takes fewer Newton iterations makes the next one longer, one that takes more, shorter.
 USUAL_ITERATIONS = 8

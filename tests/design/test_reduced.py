@@ -19,6 +19,7 @@ from fab4d.design.reduced import (
     at_rest,
     change_density,
     fewest_points,
+    first_search,
     polished,
     refit,
     relaxed,
@@ -95,6 +96,25 @@ def test_the_solved_scene_is_reached_from_the_permanent_shape(truth: Truth, sear
     assert (done.loaded, done.unloaded) == (1.0, 1.0)
     assert balance(found.equilibria, design.rho, done.median, done.final).final < 1e-9
     assert shape_error(truth.problem, done.final.y).rms < 3e-3
+
+
+def test_larger_patches_are_taken_where_small_ones_stretch_too_far(truth: Truth) -> None:
+    problem, radii = truth.problem, tuple(radius / truth.problem.length for radius in (3.0, 9.0))
+    small, large = (first_search(problem, settings_for(problem, patch_radii=(radius,))) for radius in radii)
+    stretches = [largest_stretch(problem, found.design.median.x) for found in (small, large)]
+    assert stretches[1] < stretches[0]
+    between = 0.5 * sum(stretches)
+    for limit, expected in ((2 * stretches[0], radii[0]), (between, radii[1]), (1.01, radii[1])):
+        weights = WEIGHTS.replace(smp_max_stretch=limit, tpe_max_stretch=limit)
+        found = first_search(problem, settings_for(problem, patch_radii=radii, weights=weights))
+        assert found.patch_radius == expected
+        assert np.isclose(largest_stretch(problem, found.design.median.x), stretches[radii.index(expected)])
+
+
+def largest_stretch(problem: Problem, x: np.ndarray) -> float:
+    body = problem.body
+    F = np.einsum("mai,maj->mij", x[body.elements], body.dN.mean(axis=1))
+    return float(np.linalg.svd(F, compute_uv=False).max())
 
 
 def test_states_are_in_equilibrium_and_within_bounds(searched: list[Search]) -> None:

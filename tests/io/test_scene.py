@@ -156,6 +156,14 @@ def test_a_rig_card_may_state_its_travel(tmp_path: Path) -> None:
     assert load_rig("bench", tmp_path).max_travel is None
 
 
+def test_a_rig_card_may_state_larger_pads(tmp_path: Path) -> None:
+    lines = (CARDS / "rigs" / "bench.toml").read_text(encoding="utf-8").splitlines()
+    usual = "\n".join(line for line in lines if not line.startswith("larger_patch_radii_mm"))
+    for name, more, radii in (("usual", "", (4.0,)), ("more", "\nlarger_patch_radii_mm = [9, 6]", (4.0, 6.0, 9.0))):
+        (tmp_path / f"{name}.toml").write_text(usual + more)
+        assert load_rig(f"{name}.toml", tmp_path).patch_radii == radii
+
+
 def test_the_three_presets_differ_where_the_paper_is_misprinted() -> None:
     corrected, printed, fig7 = (load_material(name, Path()) for name in ("paper-corrected", "paper-printed", "fig7"))
     assert corrected.warnings() == []
