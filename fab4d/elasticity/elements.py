@@ -9,7 +9,7 @@ from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.mesh.topology import TET_EDGES
 
 # Four-point rule of degree 2 on the reference tet, barycentric coordinates. Source: Keast, CMAME 55 (1986) 339.
-_A, _B = 0.58541020, 0.13819660
+_A, _B = (5 + 3 * 5**0.5) / 20, (5 - 5**0.5) / 20
 QUADRATURE_4 = np.full((4, 4), _B) + (_A - _B) * np.eye(4)
 
 # Gradients of the barycentric coordinates on the reference tet (4, 3).
