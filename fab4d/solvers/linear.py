@@ -29,6 +29,9 @@ REFINE_ABOVE = 1e-14
 MAX_REFINEMENTS = 5
 # Relative to its own compliance, how far rslab's factor lets a constraint give before refinement.
 CONSTRAINT_SOFTNESS = 1e-6
+# Below so many unknowns rslab's threads gain a tenth on an idle machine and lose several times that on a busy one, for
+# they wait actively.
+THREADED_FROM = 50_000
 # A factor whose refined solutions stay above both, relative to |A| |x| + |b| and to |b|, hides vanishing pivots.
 UNUSABLE_ABOVE, UNSOLVED_ABOVE = 1e-12, 1e-6
 
@@ -207,7 +210,8 @@ class _RslabAnalysis:
 
         n = len(indptr) - 1
         pattern = csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n))
-        self._symbolic = rslab.analyze(pattern, path="ldlt", threads=threads)
+        usual = (os.cpu_count() or 1) if n >= THREADED_FROM else 1
+        self._symbolic = rslab.analyze(pattern, path="ldlt", threads=threads or usual)
         self._structure = indptr, indices
         self._scaling = _Scaling(indptr, indices)
 
