@@ -18,7 +18,7 @@ Row = dict[str, Any]
 def joined_trace(
     traces: Mapping[str, bytes | None], stages: Sequence[Mapping[str, Any]], tau_s: float | None
 ) -> list[Row]:
-    """The rows of the traces of some stages, with times from the start of the run.
+    """The rows of the traces of some stages, with times from the start of the run, all in the same tau.
 
     traces : stage -> CSV, times counted from the start of the stage
     stages : `stages` of the artifact `run`: name and wall_s, in the order of the work
@@ -74,7 +74,7 @@ def _shifted(rows: list[dict[str, str]], start: float, tau_s: float | None) -> l
     ]
     for row in numbers:
         row["wall_s"] += start
-        row["tau"] += start / tau_s if tau_s else 0.0
+        row["tau"] = row["wall_s"] / tau_s if tau_s else 0.0
         row["forces"] = int(row["forces"])
     return numbers
 

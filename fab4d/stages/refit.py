@@ -36,7 +36,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     element, left_out = element_for(mesh, profile["solver"].element)
     problem = problem_of(mesh, profile["materials"], element)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
-    trace = Trace(problem, mesh, monitor, tau_seconds(problem))
+    tau_s = tau_seconds(problem)
+    trace = Trace(problem, mesh, monitor, tau_s)
     design = _printed_design(equilibria, _relaxed_design(equilibria, relaxed), smp)
     trace.add("printed", Search(equilibria, design))
     fits = 0
@@ -51,6 +52,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     reasons = limit_reasons(problem, equilibria.patches, design, profile)
     volumes = tet_volumes(mesh["X"], mesh["tets"])
     report = {
+        "tau_s": tau_s,
         "fits": fits,
         "flipped_fraction": float(problem.volume_fractions[smp != rounded["smp"]].sum()),
         "reasons": reasons,

@@ -91,8 +91,9 @@ def _findings(check_report: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, Any]:
-    solve = inputs["solve_report"] or {}
-    run, tau_s = inputs["run"], solve.get("tau_s")
+    solve, refit = inputs["solve_report"] or {}, inputs["refit_report"] or {}
+    # Of the element that is delivered; without a fit, of the search.
+    run, tau_s = inputs["run"], refit.get("tau_s", solve.get("tau_s"))
     stages = [
         {"name": s["name"], "wall_s": s["wall_s"], "tau": s["wall_s"] / tau_s if tau_s else None} for s in run["stages"]
     ]
