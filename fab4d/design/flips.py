@@ -185,7 +185,8 @@ def _predicted(modes: ErrorModes, tets: IntArray, by: FloatArray) -> tuple[Float
 def _held_follow(by_held: FloatArray) -> FloatArray:
     """(q, 3K) maps H^T v to the part of v (q,) that held positions take away: H^T (H H^T + ridge)^-1."""
     k = len(by_held)
-    if k == 0:
+    # A part all of TPE comes back to its permanent shape wherever it was held.
+    if not by_held.any():
         return by_held.T
     gram = by_held @ by_held.T
     return np.linalg.solve(gram + HELD_RIDGE * np.trace(gram) / k * np.eye(k), by_held).T

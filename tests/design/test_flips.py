@@ -104,6 +104,15 @@ def test_nothing_is_flipped_at_the_target_or_where_nothing_may_be() -> None:
         np.testing.assert_array_equal(same.rho, design.rho)
 
 
+def test_a_part_without_smp_is_left_as_it_is() -> None:
+    """It comes back to its permanent shape wherever it is held, and has no interface."""
+    problem = bar(degrees=30.0)
+    equilibria = two_patches(problem)
+    design = held_design(equilibria, np.zeros(problem.n_tets), problem.X_temp)
+    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    assert not same.rho.any()
+
+
 def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
     problem = bar(degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)

@@ -1,0 +1,100 @@
+"""The stage refit: printed labels in equilibrium with the elements of the fit, in a state that loading reaches."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from shapes.boxes import box
+from shapes.warps import Turn, ramp, rod, warped
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.forward import balance, program, same_shape
+from fab4d.io.cards import load_material, load_printer, load_rig
+from fab4d.io.scene import Acceptance, Goal, SolverSettings, Weights
+from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.mesh.tetmesh import FloatArray
+from fab4d.stages import refit, solve, threshold
+from fab4d.stages._design import patches_of
+from fab4d.stages._element import problem_like
+from fab4d.stages.monitor import SilentMonitor
+from fab4d.stages.threshold import labels_for
+
+SIZE = (60.0, 12.0, 8.0)
+PROFILE = {
+    "materials": load_material("paper-corrected", Path()),
+    "printer": load_printer("generic-dual-0.4", Path()),
+    "rig": load_rig("bench", Path()),
+    "weights": Weights(),
+    "goal": Goal(tolerance=0.8, max_forces=4),
+    "acceptance": Acceptance(),
+}
+
+Artifacts = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def inputs() -> Artifacts:
+    """A bar of 10 x 2 x 2 cells, clamped at its left end, that wants to be bent by 40 degrees, designed and rounded."""
+    X, tets = box(SIZE, (10, 2, 2), "five")
+    line = rod((8.0, SIZE[1] / 2, SIZE[2] / 2), (SIZE[0], SIZE[1] / 2, SIZE[2] / 2), (0, 0, 1))
+    bent = warped(X, line, (Turn((0, 0, 1), 40.0, lambda s: ramp(s, 0, 5)),))
+    mesh = {"X": X, "X_temp": bent, "tets": tets, "clamp": X[:, 0] <= 8.0}
+    given = {"mesh": mesh, "check_report": {"nothing_to_program": False}, "picked": None}
+    relaxed = solve.run(given, PROFILE, SilentMonitor())["relaxed"]
+    rounded = threshold.run({"mesh": mesh, "relaxed": relaxed}, PROFILE, SilentMonitor())["rounded"]
+    return {"mesh": mesh, "relaxed": relaxed, "rounded": rounded}
+
+
+@pytest.fixture(scope="module", params=["linear", "auto"])
+def fitted(request: pytest.FixtureRequest, inputs: Artifacts) -> tuple[str, Artifacts]:
+    element = request.param
+    solver = SolverSettings(element=element)
+    return element, refit.run(inputs, PROFILE | {"solver": solver}, SilentMonitor())
+
+
+def errors(found: Artifacts) -> FloatArray:
+    rows = csv.DictReader(io.StringIO(found["refit_trace"].decode()))
+    return np.array([float(row["rms_mm"]) for row in rows])
+
+
+def equilibria_of(inputs: Artifacts, found: Artifacts) -> Equilibria:
+    problem = problem_like(inputs["mesh"], PROFILE["materials"], found["printed"]["x"])
+    return Equilibria(problem, patches_of(problem, found["printed"]))
+
+
+def test_the_elements_are_those_asked_for(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
+    """A bar two tets thick is coarse, so that quadratic tets are taken by default."""
+    element, found = fitted
+    order = equilibria_of(inputs, found).problem.body.order
+    assert order == (1 if element == "linear" else 2)
+    told = [item["what"] for item in found["refit_report"]["left_out"]]
+    assert told == (["quadratic elements"] if element == "linear" else [])
+
+
+def test_the_fit_comes_nearer_than_the_relaxed_positions(fitted: tuple[str, Artifacts]) -> None:
+    rms = errors(fitted[1])
+    assert rms[-1] < 0.9 * rms[0]
+    assert rms[-1] < 0.8
+
+
+def test_loading_ends_in_the_fitted_state(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
+    found = fitted[1]
+    equilibria, printed = equilibria_of(inputs, found), found["printed"]
+    smp, L0 = found["labels"]["smp"].astype(np.float64), equilibria.problem.length
+    x, forces = printed["x"] / L0, printed["patch_force"] / equilibria.problem.force
+    done = program(equilibria, smp, x, forces)
+    assert same_shape(done, x)
+    left = balance(equilibria, smp, done.median, done.final)
+    assert max(left.median, left.final) < 1e-8
+    y = done.final.y * L0
+    R, t = best_rigid_motion(y, printed["y"])
+    np.testing.assert_allclose(y @ R.T + t, printed["y"], atol=1e-6)
+
+
+def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
+    mesh, smp = inputs["mesh"], fitted[1]["labels"]["smp"]
+    again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), PROFILE["printer"])
+    np.testing.assert_array_equal(again.smp, smp)
