@@ -30,6 +30,8 @@ LEAST_GAIN, LEAST_ROUND_GAIN = 1e-3, 1e-2
 FIRST_FACTORS = (0.25, 1.0)
 FACTOR_BOUNDS = ((0.03, 0.6), (0.3, 4.0))
 HELD_RIDGE = 1e-4
+# Steps of the held positions after each round; once all are made, they are fitted to the end.
+FOLLOWING_STEPS = 2
 
 Printable = Callable[[BoolArray], BoolArray]
 Flippable = Callable[[BoolArray, int], bool]
@@ -71,7 +73,7 @@ def polish_labels(
 
     design : of 0/1 labels, held positions fitted to them; the result is such a design too
     """
-    L = smoothness_matrix(equilibria.problem)
+    L, start = smoothness_matrix(equilibria.problem), design
     plain = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
     value = evaluate(equilibria, plain, L, design)
     factors, batch, poor = np.array(FIRST_FACTORS), FIRST_BATCH, 0
@@ -94,7 +96,7 @@ def polish_labels(
         if new < value:
             design, value = fitted, new
             watch(Search(equilibria, design))
-    return design
+    return refit(equilibria, design, weights, watch) if design is not start else start
 
 
 def _flipped(
@@ -107,7 +109,7 @@ def _flipped(
         printed = change_density(equilibria, design, settings.printable(labels).astype(np.float64))
     except EquilibriumError:
         return None
-    return printed, refit(equilibria, printed, weights, lambda at: None, iterations=4)  # noqa: ARG005
+    return printed, refit(equilibria, printed, weights, lambda at: None, iterations=FOLLOWING_STEPS)  # noqa: ARG005
 
 
 # -- sensitivities
