@@ -47,6 +47,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         design, fits = _reachable_fit(equilibria, design, weights, polish, trace)
     smp = design.rho > 0.5
     design = polished(equilibria, design)
+    trace.add("refit", Search(equilibria, design))
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
     reasons = limit_reasons(problem, equilibria.patches, design, profile)

@@ -137,7 +137,7 @@ def test_usual_points_are_half_to_all() -> None:
 def judged(scene: Scene, checked: dict[str, Any], kept: Kept) -> tuple[Any, ...]:
     """Problem, design and print of row 3x1, which is acceptable."""
     problem = problem_of(checked["mesh"], scene.materials, "linear")
-    found = search_from(problem, scene.rig, kept[1].saved["3x1"])
+    found = search_from(problem, kept[1].saved["3x1"])
     weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
     return problem, found, as_printed(problem, checked["mesh"], scene.printer, scene.goal, weights, found, np.inf)
 
