@@ -76,6 +76,10 @@ def shape_path(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -
     """
     F = deformation_gradients(X, x, tets)
     U, s, Vt = np.linalg.svd(F)
+    # The corners of a curved quadratic tet may be turned inside out: the stretch is then negative, not the rotation.
+    side = np.sign(np.linalg.det(U @ Vt))
+    U[:, :, 2] *= side[:, None]
+    s[:, 2] *= side
     R = U @ Vt
     stretches = np.swapaxes(Vt, 1, 2) @ (s[:, :, None] * Vt)
     anchored = np.flatnonzero(fixed) if fixed.any() else np.zeros(1, np.int64)

@@ -153,3 +153,12 @@ def test_separate_pieces_are_followed_each(bar) -> None:
     path = shape_path(both, wanted, np.vstack([tets, tets + len(X)]), both[:, 0] == 0.0)
     np.testing.assert_allclose(path.at(0.5)[: len(X)], path_to(bent(X, 250.0), bar).at(0.5), atol=1e-9)
     np.testing.assert_allclose(path.at(0.5)[len(X) :] - aside, path_to(bent(X, -250.0), bar).at(0.5), atol=1e-9)
+
+
+def test_a_tet_that_is_turned_inside_out_is_followed(bar: tuple[np.ndarray, np.ndarray]) -> None:
+    """As the corners of a curved quadratic tet may be; the path still ends in the shape."""
+    X, tets = bar
+    x = bent(X, 90.0)
+    x[np.argmax(X @ [1.0, 1.0, 1.0])] -= [0.9, 0.9, 0.9]
+    assert np.linalg.det(deformation_gradients(X, x, tets)).min() < 0
+    np.testing.assert_allclose(path_to(x, bar).at(1.0), x, atol=1e-9)
