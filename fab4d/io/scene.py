@@ -73,7 +73,7 @@ class SolverSettings:
     """method: `reduced`; element of the last fit: `auto`, `linear` or `quadratic`; seed of every random choice."""
 
     method: str = "reduced"
-    element: str = "linear"
+    element: str = "auto"
     seed: int = 0
 
 

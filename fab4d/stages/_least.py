@@ -24,9 +24,11 @@ USABLE_TOLERANCE = 0.9
 
 @dataclass(frozen=True, eq=False)
 class LeastSmp:
-    """The design with the least SMP that is acceptable, its RMS error as printed in L0, and all that was tried."""
+    """The design with the least SMP that is acceptable, also as it was before rounding, its RMS error as printed in L0,
+    and all that was tried."""
 
     found: Search
+    relaxed: Search
     printed_rms: float
     trials: list[dict[str, Any]]
 
@@ -99,7 +101,7 @@ def least_smp(
     """
     tried = _Bisection(problem, mesh, profile, settings, trace, monitor).tried(first)
     best = tried[least([done.trial for done in tried])] if tried[0].trial.acceptable else tried[0]
-    return LeastSmp(best.found, best.rms, [_row(problem, done) for done in tried])
+    return LeastSmp(best.found, best.relaxed, best.rms, [_row(problem, done) for done in tried])
 
 
 def _row(problem: Problem, done: _Tried) -> dict[str, Any]:

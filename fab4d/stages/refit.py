@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.finish import carried_over
 from fab4d.design.flips import FlipSettings, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
-from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
+from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import Patches, outward_normals
-from fab4d.design.problem import Problem, at_nodes
+from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import smp_clusters
@@ -118,19 +119,13 @@ def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Go
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:
-    """The relaxed design, found with linear tets, in equilibrium for the elements of the fit.
+    """The relaxed design in equilibrium for the elements of the fit.
 
     Raises EquilibriumError where these find no equilibrium near it.
     """
-    problem, rho = equilibria.problem, relaxed["rho"]
-    x, y = (at_nodes(problem, relaxed[name] / problem.length) for name in ("x", "y"))
-    forces = relaxed["patch_force"] / problem.force
-    held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
-    median = equilibria.solve_median(rho, held, x, forces, SEARCH_TOLERANCE, 100)
-    design = None
-    if median.solution.converged:
-        y = equilibria.free_turning.repeat(x, y, median.x)
-        design = equilibrate(equilibria, rho, held, median.x, median.forces, y, max_iterations=100)
+    problem = equilibria.problem
+    x, y = (relaxed[name] / problem.length for name in ("x", "y"))
+    design = carried_over(equilibria, relaxed["rho"], x, y, relaxed["patch_force"] / problem.force)
     if design is None:
         msg = "the relaxed design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
         raise EquilibriumError(msg)

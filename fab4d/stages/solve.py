@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from fab4d.design.finish import rounded_in
 from fab4d.design.objective import force_excess, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, solve_reduced
 from fab4d.errors import SceneError
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
+from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
 from fab4d.stages._search import search_arrays, search_from
@@ -45,16 +47,17 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         why = [
             {"what": "design, forces and rig sheet", "why": "the temporary shape is the permanent one, moved rigidly"}
         ]
-        return _artifacts(problem, rest, trace, {"tau_s": tau_s, "left_out": why})
+        return _artifacts(rest, trace, {"tau_s": tau_s, "left_out": why})
     if inputs["picked"] is not None:
         return _picked(problem, inputs["picked"], trace, tau_s)
-    found, attempts, rms = _search(problem, mesh, profile, trace, monitor)
+    found, relaxed, attempts, rms = _search(problem, mesh, profile, trace, monitor)
     least = None
+    settings = search_settings(problem, profile, attempts - 1, found.equilibria.patches.count)
     if profile["goal"].smp == "least":
-        settings = search_settings(problem, profile, attempts - 1, found.equilibria.patches.count)
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
         least = least_smp(problem, mesh, sections, settings, found, trace, monitor)
-        found, rms = least.found, least.printed_rms
+        found, relaxed, rms = least.found, least.relaxed, least.printed_rms
+    finished = _finished(mesh, profile, relaxed, settings, trace)
     report = {
         "tau_s": tau_s,
         "iterations": len(trace.rows),
@@ -64,7 +67,21 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "limited_by": _limited_by(problem, profile, found),
         "left_out": LEFT_OUT,
     }
-    return _artifacts(problem, found, trace, report)
+    return _artifacts(finished or found, trace, report)
+
+
+def _finished(
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    relaxed: Search,
+    settings: ReducedSettings,
+    trace: Trace,
+) -> Search | None:
+    """The relaxed design rounded in the elements of the last fit; None where these are linear or lose it on the way."""
+    element, _ = element_for(mesh, profile["solver"].element)
+    if element == "linear" or relaxed.phase is not Phase.ROUND:
+        return None
+    return rounded_in(problem_of(mesh, profile["materials"], element), relaxed, settings, trace.add)
 
 
 def _picked(problem: Problem, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float) -> dict[str, Any]:
@@ -72,7 +89,7 @@ def _picked(problem: Problem, picked: Mapping[str, np.ndarray], trace: Trace, ta
     row, found = json.loads(str(picked["row"])), search_from(problem, picked)
     trace.add("picked", found)
     left_out = [{"what": "search for a design", "why": f"row {row['id']} of the tradeoff is picked"}]
-    return _artifacts(problem, found, trace, {"tau_s": tau_s, "picked": row, "left_out": left_out})
+    return _artifacts(found, trace, {"tau_s": tau_s, "picked": row, "left_out": left_out})
 
 
 def _refuse_weights(weights: Weights, goal: Goal) -> None:
@@ -88,14 +105,15 @@ def _refuse_weights(weights: Weights, goal: Goal) -> None:
 
 def _search(
     problem: Problem, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], trace: Trace, monitor: Monitor
-) -> tuple[Search, int, float]:
-    """The best design of the attempts made, how many were made, and its RMS error as printed, in L0."""
+) -> tuple[Search, Search, int, float]:
+    """The best design of the attempts, the last relaxed one, how many were made, and the RMS error as printed, L0."""
     first, start = _resumed(problem, trace, monitor)
     best, least = _restored_best(problem, monitor)
+    before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
     count = _points(problem, profile, trace, monitor)
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
-        watch = _watch(attempt, start, trace, monitor)
+        watch = _watch(attempt, start, trace, monitor, before_rounding)
         found = solve_reduced(problem, settings, watch, start)
         start, weights = None, settings.weights
         rms = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, weights.error_scale).rms
@@ -105,10 +123,11 @@ def _search(
         if least <= settings.weights.error_scale or _hopeless(profile, settings, found):
             break
     assert best is not None  # at least one attempt is made
-    return best, attempt + 1, least
+    return best, before_rounding[-1], attempt + 1, least
 
 
-def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor) -> Watch:
+def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor, before_rounding: list[Search]) -> Watch:
+    """Keeps every state, and adds those that are about to be rounded to `before_rounding`."""
     phase = "start" if start is None else start.phase.value
 
     def watch(at: Search) -> None:
@@ -118,6 +137,7 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor) -
         monitor.save(CHECKPOINT, _checkpoint(attempt, at, trace))
         if at.phase is Phase.ROUND and at.iteration == 0:
             monitor.save(RELAXED, search_arrays(at))
+            before_rounding.append(at)
 
     return watch
 
@@ -194,8 +214,8 @@ def search_settings(
     )
 
 
-def _artifacts(problem: Problem, found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:
-    design = found.design
+def _artifacts(found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:
+    problem, design = found.equilibria.problem, found.design
     relaxed = {
         "rho": design.rho,
         "x": design.median.x * problem.length,
@@ -221,6 +241,11 @@ def _resumed(problem: Problem, trace: Trace, monitor: Monitor) -> tuple[int, Sea
         return 0, None
     trace.go_on(saved["trace"].tobytes())
     return int(saved["attempt"]), search_from(problem, saved)
+
+
+def _restored_relaxed(problem: Problem, monitor: Monitor) -> list[Search]:
+    saved = monitor.restore(RELAXED)
+    return [] if saved is None else [search_from(problem, saved)]
 
 
 def _restored_best(problem: Problem, monitor: Monitor) -> tuple[Search | None, float]:

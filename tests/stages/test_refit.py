@@ -28,6 +28,7 @@ PROFILE = {
     "printer": load_printer("generic-dual-0.4", Path()),
     "rig": load_rig("bench", Path()),
     "weights": Weights(),
+    "solver": SolverSettings(element="linear"),
     "goal": Goal(tolerance=0.8, max_forces=4),
     "acceptance": Acceptance(),
 }

@@ -10,7 +10,7 @@ from shapes.boxes import box
 from shapes.warps import Turn, ramp, rod, warped
 
 from fab4d.io.cards import load_material, load_printer, load_rig
-from fab4d.io.scene import Goal, Weights
+from fab4d.io.scene import Goal, SolverSettings, Weights
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run
 
@@ -20,6 +20,7 @@ PROFILE = {
     "printer": load_printer("generic-dual-0.4", Path()),
     "rig": load_rig("bench", Path()),
     "weights": Weights(),
+    "solver": SolverSettings(element="linear"),
 }
 
 

@@ -1,0 +1,68 @@
+"""A relaxed design carried over to other elements of the same mesh, and rounded there."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
+from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
+from fab4d.design.objective import smoothness_matrix
+from fab4d.design.patches import patches_from_faces
+from fab4d.design.problem import Problem, at_nodes
+from fab4d.design.reduced import (
+    EXCHANGED,
+    LARGEST_DAMPING,
+    STEPS,
+    Phase,
+    ReducedSettings,
+    Search,
+    undecided_fraction,
+)
+from fab4d.mesh.tetmesh import FloatArray
+
+# So many steps in a row that are not taken, or only with the largest damping, end the rounding: the equilibria turn
+# unstable on its way.
+MOST_HELD_BACK = 3
+
+Watch = Callable[[str, Search], None]
+
+
+def carried_over(
+    equilibria: Equilibria, rho: FloatArray, x: FloatArray, y: FloatArray, forces: FloatArray
+) -> Design | None:
+    """The design of these shapes at the vertices, or at all nodes, in the elements of `equilibria`.
+
+    rho (m,); x, y (n or N, 3) median and final shape; forces (K, 3). None where these find no equilibrium near it.
+    """
+    problem = equilibria.problem
+    x, y = (shape if len(shape) == problem.n_nodes else at_nodes(problem, shape) for shape in (x, y))
+    held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
+    median = equilibria.solve_median(rho, held, x, forces, SEARCH_TOLERANCE, 100)
+    if not median.solution.converged:
+        return None
+    y = equilibria.free_turning.repeat(x, y, median.x)
+    return equilibrate(equilibria, rho, held, median.x, median.forces, y, max_iterations=100)
+
+
+def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
+    """A near 0/1 design in the elements of `problem` from a relaxed one, about to be rounded, in other elements.
+
+    watch : is shown the phase and the state after each step
+    None where the elements find no equilibrium near it, or none on the way to 0 and 1.
+    """
+    before, design = relaxed.equilibria.patches, relaxed.design
+    equilibria = Equilibria(problem, patches_from_faces(problem, before.centers, before.faces, before.offsets))
+    start = carried_over(equilibria, design.rho, design.median.x, design.final.y, design.median.forces)
+    if start is None:
+        return None
+    at = Search(equilibria, start, relaxed.patch_radius, lam_SMP=relaxed.lam_SMP, exchanges=EXCHANGED)
+    watch("carried over", at)
+    L, held_back = smoothness_matrix(problem), 0
+    while at.phase is not Phase.DONE:
+        phase = at.phase
+        at = STEPS[phase](replace(at, accepted=True), settings, L)
+        watch(phase.value, at)
+        hard = phase is Phase.ROUND and (not at.accepted or at.damping >= LARGEST_DAMPING)
+        held_back = held_back + 1 if hard else 0
+        if held_back == MOST_HELD_BACK:
+            return None
+    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else None
