@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import smoothness_matrix
@@ -15,13 +17,18 @@ from fab4d.design.reduced import (
     Phase,
     ReducedSettings,
     Search,
+    change_density,
     undecided_fraction,
 )
+from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import FloatArray
 
 # So many steps in a row that are not taken, or only with the largest damping, end the rounding: the equilibria turn
 # unstable on its way.
 MOST_HELD_BACK = 3
+
+# Up to this share of undecided tets is rounded at once where the steps come to nothing.
+LAST_SHARE = 0.05
 
 Watch = Callable[[str, Search], None]
 
@@ -64,5 +71,19 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
         hard = phase is Phase.ROUND and (not at.accepted or at.damping >= LARGEST_DAMPING)
         held_back = held_back + 1 if hard else 0
         if held_back == MOST_HELD_BACK:
-            return None
-    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else None
+            break
+    return _decided(at, settings.undecided_fraction)
+
+
+def _decided(at: Search, undecided: float) -> Search | None:
+    """The state with its last few densities rounded; None where more than those are left, or none holds them."""
+    left = undecided_fraction(at.design.rho)
+    if left <= undecided:
+        return at
+    if left > LAST_SHARE:
+        return None
+    try:
+        design = change_density(at.equilibria, at.design, np.round(at.design.rho))
+    except EquilibriumError:
+        return None
+    return replace(at, design=design, phase=Phase.DONE)
