@@ -1,0 +1,71 @@
+"""A relaxed design of linear tets, carried over to quadratic ones and rounded there."""
+
+import numpy as np
+import pytest
+from bars import bar
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.finish import LAST_SHARE, carried_over, rounded_in
+from fab4d.design.forward import balance
+from fab4d.design.gauss_newton import held_positions
+from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.patches import patches_from_faces
+from fab4d.design.problem import Problem
+from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed, undecided_fraction
+
+TOLERANCE = 5e-3
+WEIGHTS = ObjectiveWeights(error_scale=TOLERANCE, lam_SMP=0.05, lam_smooth=0.3)
+
+
+@pytest.fixture(scope="module")
+def found() -> Search:
+    """A bar that wants to be bent by 40 degrees, relaxed in linear tets."""
+    problem = bar(degrees=40.0)
+    return relaxed(problem, settings_for(problem), lambda at: None)  # noqa: ARG005
+
+
+@pytest.fixture(scope="module")
+def quadratic() -> Problem:
+    return bar(degrees=40.0, element="quadratic")
+
+
+def settings_for(problem: Problem) -> ReducedSettings:
+    return ReducedSettings(4, (6.0 / problem.length,), WEIGHTS)
+
+
+def test_what_is_carried_over_is_in_equilibrium_at_the_same_hold_positions(found: Search, quadratic: Problem) -> None:
+    patches, design = found.equilibria.patches, found.design
+    equilibria = Equilibria(quadratic, patches_from_faces(quadratic, patches.centers, patches.faces, patches.offsets))
+    median, y = design.median, design.final.y
+    there = carried_over(equilibria, design.rho, median.x, y, median.forces)
+    assert there is not None
+    left = balance(equilibria, there.rho, there.median, there.final)
+    assert max(left.median, left.final) < 1e-4
+    # The mean of a patch weighs the mid-edge nodes of a bent surface, so that it moves a little.
+    before, after = held_positions(found.equilibria, median), held_positions(equilibria, there.median)
+    np.testing.assert_allclose(after, before, atol=1e-3)
+    again = carried_over(equilibria, design.rho, there.median.x, there.final.y, there.median.forces)
+    assert again is not None
+    np.testing.assert_allclose(again.median.x, there.median.x, atol=1e-6)
+
+
+def test_a_design_is_rounded_in_the_other_elements(found: Search, quadratic: Problem) -> None:
+    shown: list[tuple[str, Search]] = []
+    at = rounded_in(quadratic, found, settings_for(quadratic), lambda phase, at: shown.append((phase, at)))
+    assert at is not None
+    assert at.phase is Phase.DONE
+    assert len(at.design.median.x) == quadratic.n_nodes
+    assert undecided_fraction(at.design.rho) <= settings_for(quadratic).undecided_fraction
+    assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
+    assert [phase for phase, _ in shown][:2] == ["carried over", "relax"]
+    shares = [undecided_fraction(state.design.rho) for _, state in shown]
+    assert shares[0] > 10 * LAST_SHARE
+
+
+def test_without_an_equilibrium_nothing_is_rounded(found: Search) -> None:
+    """The wanted shape of another body: its tets are upside down there."""
+    mirrored = bar(degrees=40.0, element="quadratic")
+    far = found.design.median.x * [1.0, 1.0, -1.0]
+    patches = found.equilibria.patches
+    equilibria = Equilibria(mirrored, patches_from_faces(mirrored, patches.centers, patches.faces, patches.offsets))
+    assert carried_over(equilibria, found.design.rho, far, far, found.design.median.forces) is None
