@@ -27,6 +27,8 @@ from fab4d.mesh.tetmesh import FloatArray
 # unstable on its way.
 MOST_HELD_BACK = 3
 
+# The design is near already: a few steps relax it, and it is rounded in half the steps of a search from the start.
+RELAX_ITERATIONS, ROUND_GROWTH = 3, 2.5
 # Up to this share of undecided tets is rounded at once where the steps come to nothing.
 LAST_SHARE = 0.05
 
@@ -63,6 +65,7 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
         return None
     at = Search(equilibria, start, relaxed.patch_radius, lam_SMP=relaxed.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
+    settings = replace(settings, relax_iterations=RELAX_ITERATIONS, round_growth=ROUND_GROWTH)
     L, held_back = smoothness_matrix(problem), 0
     while at.phase is not Phase.DONE:
         phase = at.phase

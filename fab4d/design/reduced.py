@@ -34,7 +34,8 @@ FIRST_COUNT = 4
 
 @dataclass(frozen=True)
 class ReducedSettings:
-    """Number of the patches and the radii (L0) to choose from, the objective, and how long each phase may go on."""
+    """Number of the patches and the radii (L0) to choose from, the objective, how long each phase may go on, and the
+    factor by which lam_round grows in each step."""
 
     n_points: int
     patch_radii: tuple[float, ...]
@@ -43,6 +44,7 @@ class ReducedSettings:
     relax_iterations: int = 15
     round_iterations: int = 40
     undecided_fraction: float = 2e-4
+    round_growth: float = 1.6
 
 
 class Phase(Enum):
@@ -270,7 +272,7 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
         design=step.design,
         phase=Phase.DONE if finished else Phase.ROUND,
         lam_SMP=lam_SMP,
-        lam_round=1.6 * at.lam_round,
+        lam_round=settings.round_growth * at.lam_round,
         damping=min(step.damping, LARGEST_DAMPING),
         iteration=at.iteration + 1,
         accepted=step.accepted,

@@ -12,9 +12,9 @@ from fab4d.stages._design import problem_of
 
 # Bars of 8 linear tets across bend to 0.87 of the true flexibility (model.md section 5): forces are at most 15 % large.
 FINE_ELEMENTS = 8.0
-# More unknowns take longer than a design is worth: at 55,000 a factorisation takes 1 s and 0.2 GB, at 120,000 some 4 s
-# and 0.7 GB, and a fit with its verification some 200 of them.
-MOST_QUADRATIC_DOFS = 120_000
+# More unknowns take longer than a design is worth: at 34,000 a factorisation takes 0.7 s, and rounding, fit and
+# verification take some 400 of them.
+MOST_QUADRATIC_DOFS = 40_000
 
 
 def element_for(mesh: Mapping[str, np.ndarray], wanted: str) -> tuple[str, list[dict[str, str]]]:
