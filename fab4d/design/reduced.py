@@ -26,6 +26,8 @@ EXCHANGE_AFTER, EXCHANGED, GOOD_ENOUGH = 3, 4, 0.25
 STEPS_AFTER_EXCHANGE = 2
 # While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
 ROUNDING_LOSS = 2.5
+# While there is too much SMP, its price grows by this power of the growth of lam_round.
+DEARER = 0.86
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # The smallest number of points is looked for from here.
@@ -258,7 +260,7 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Raise lam_round until all but a few densities are 0 or 1, held positions following."""
     too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
-    lam_SMP = 1.5 * at.lam_SMP if too_much else at.lam_SMP
+    lam_SMP = settings.round_growth**DEARER * at.lam_SMP if too_much else at.lam_SMP
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
     scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
     weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)

@@ -77,11 +77,16 @@ def _finished(
     settings: ReducedSettings,
     trace: Trace,
 ) -> Search | None:
-    """The relaxed design rounded in the elements of the last fit; None where these are linear or lose it on the way."""
+    """The relaxed design rounded in the elements of the last fit; None where these are linear, lose it on the way or
+    need more SMP than the goal allows."""
     element, _ = element_for(mesh, profile["solver"].element)
     if element == "linear" or relaxed.phase is not Phase.ROUND:
         return None
-    return rounded_in(problem_of(mesh, profile["materials"], element), relaxed, settings, trace.add)
+    problem = problem_of(mesh, profile["materials"], element)
+    finished, most = rounded_in(problem, relaxed, settings, trace.add), profile["goal"].max_smp_fraction
+    if finished is not None and most is not None and problem.volume_fractions @ finished.design.rho > most:
+        return None
+    return finished
 
 
 def _picked(problem: Problem, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float) -> dict[str, Any]:
