@@ -14,7 +14,7 @@ from fab4d.stages._design import problem_of
 FINE_ELEMENTS = 8.0
 # More unknowns take longer than a design is worth: at 34,000 a factorisation takes 0.7 s, and rounding, fit and
 # verification take some 400 of them.
-MOST_QUADRATIC_DOFS = 40_000
+MOST_QUADRATIC_DOFS = 35_000
 
 
 def element_for(mesh: Mapping[str, np.ndarray], wanted: str) -> tuple[str, list[dict[str, str]]]:
