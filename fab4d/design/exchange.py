@@ -4,7 +4,7 @@ All forces, those of the points held and those of candidates, are put in one lin
 best single exchanges follow from small dense systems; what they promise is then judged by the equilibria.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +17,9 @@ from fab4d.design.problem import Problem
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 
 CANDIDATES = 100
-# An exchange has to lower the predicted objective by this share of it; no more are made at once.
-LEAST_GAIN, MOST_EXCHANGES = 0.03, 6
+# An exchange has to lower the predicted objective by this share of it, or by the smaller one while the tolerance is
+# missed; no more are made at once.
+LEAST_GAIN, LEAST_GAIN_BEYOND, MOST_EXCHANGES = 0.03, 0.01, 6
 # Additions that are tried with each removal.
 BEST_ADDITIONS = 8
 FORCE_RIDGE = 1e-3
@@ -56,23 +57,25 @@ def dofs(points: Sequence[int]) -> IntArray:
 
 def exchanged(
     equilibria: Equilibria, weights: ObjectiveWeights, model: Model, design: Design, radius: float
-) -> tuple[Equilibria, Design] | None:
-    """The design held at better points, in equilibrium, or None where no exchange promises enough.
+) -> Iterator[tuple[Equilibria, Design]]:
+    """The design held at better points, in equilibrium: with all exchanges that promise enough, half of them, the best.
 
     model : of the objective at the design        radius : of a patch, L0
+    Empty where no exchange promises enough or leads to an equilibrium.
     """
     patches, problem = equilibria.patches, equilibria.problem
     centers = candidate_centers(problem, patches, shape_error(problem, design.final.y).e, radius)
     if not patches.count or not len(centers):
-        return None
+        return
     forces = force_model(equilibria, weights, model, design, _separate_patches(problem, centers, radius))
-    chosen = best_points(forces, patches.count)
-    gone = np.setdiff1d(np.arange(patches.count), chosen)
-    if not len(gone):
-        return None
-    kept = np.array([k for k in chosen if k < patches.count], np.int64)
-    new = np.array([k - patches.count for k in chosen if k >= patches.count], np.int64)
-    return _moved(equilibria, design, kept, np.concatenate([patches.centers[kept], centers[new]]), radius)
+    better = better_points(forces, patches.count)
+    for made in sorted({len(better), (len(better) + 1) // 2, min(len(better), 1)} - {0}, reverse=True):
+        chosen = better[made - 1]
+        kept = np.array([k for k in chosen if k < patches.count], np.int64)
+        new = np.array([k - patches.count for k in chosen if k >= patches.count], np.int64)
+        moved = _moved(equilibria, design, kept, np.concatenate([patches.centers[kept], centers[new]]), radius)
+        if moved is not None:
+            yield moved
 
 
 # -- candidates
@@ -140,12 +143,17 @@ def _shape_by_force(model: Model, candidates: Patches, n_nodes: int) -> FloatArr
     return np.hstack([of_points, lin.free.solve_many(r) - of_points @ z[n:]])
 
 
-def best_points(model: ForceModel, count: int) -> list[int]:
-    """`count` of the model's points: those held, changed one by one as long as each change promises enough."""
+def better_points(model: ForceModel, count: int) -> list[list[int]]:
+    """`count` of the model's points after one exchange, two, and so on, as long as each promises enough.
+
+    The first `count` points are those held.
+    """
     total = len(model.present) // 3
     chosen, gone = list(range(count)), set[int]()
     value = model.without(chosen, [])
-    for _ in range(MOST_EXCHANGES):
+    least = LEAST_GAIN if model.value <= 1 else LEAST_GAIN_BEYOND
+    better: list[list[int]] = []
+    while len(better) < MOST_EXCHANGES:
         others = [k for k in range(total) if k not in chosen]
         added = sorted(others, key=lambda k: model.without([*chosen, k], sorted(gone - {k})))
         options = []
@@ -155,10 +163,11 @@ def best_points(model: ForceModel, count: int) -> list[int]:
                 missing = (gone | ({old} if old < count else set())) - {new}
                 options.append((model.without(after, sorted(missing)), after, missing))
         best, after, missing = min(options, key=lambda option: option[0])
-        if best > (1 - LEAST_GAIN) * value:
+        if best > (1 - least) * value:
             break
         value, chosen, gone = best, after, missing
-    return chosen
+        better.append(chosen)
+    return better
 
 
 # -- the way there

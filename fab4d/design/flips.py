@@ -30,6 +30,9 @@ LEAST_GAIN, LEAST_ROUND_GAIN = 1e-3, 1e-2
 FIRST_FACTORS = (0.25, 1.0)
 FACTOR_BOUNDS = ((0.03, 0.6), (0.3, 4.0))
 HELD_RIDGE = 1e-4
+# Flips whose equilibria are farther away than steps of this share of the change go are given up.
+# Then so many times fewer are tried.
+SMALLEST_STEP, FEWER_AFTER_FAILURE = 0.25, 5
 # Steps of the held positions after each round; once all are made, they are fitted to the end.
 FOLLOWING_STEPS = 2
 
@@ -78,7 +81,7 @@ def polish_labels(
     value = evaluate(equilibria, plain, L, design)
     factors, batch, poor = np.array(FIRST_FACTORS), FIRST_BATCH, 0
     for _ in range(settings.rounds):
-        if poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
+        if not batch or poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
             break
         modes = error_modes(equilibria.problem, build_model(equilibria, plain, L, design), design)
         flips = choose_flips(equilibria.problem, modes, design.rho, factors, settings, batch)
@@ -86,7 +89,7 @@ def polish_labels(
             break
         trial = _flipped(equilibria, design, flips, plain, settings)
         if trial is None:
-            batch, poor = max(batch // 3, 1), poor + 1
+            batch //= FEWER_AFTER_FAILURE
             continue
         printed, fitted = trial
         factors = _corrected(factors, modes, design, printed, equilibria.problem)
@@ -106,7 +109,8 @@ def _flipped(
     labels = design.rho > 0.5
     labels[flips] = ~labels[flips]
     try:
-        printed = change_density(equilibria, design, settings.printable(labels).astype(np.float64))
+        rho = settings.printable(labels).astype(np.float64)
+        printed = change_density(equilibria, design, rho, SMALLEST_STEP, stay=True)
     except EquilibriumError:
         return None
     return printed, refit(equilibria, printed, weights, lambda at: None, iterations=FOLLOWING_STEPS)  # noqa: ARG005

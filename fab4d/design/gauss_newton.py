@@ -224,17 +224,24 @@ def gauss_newton_step(
     damping: float,
     movable: BoolArray | None = None,
     tries: int = 6,
+    least_promise: float = 0.0,
 ) -> Step:
     """One Levenberg-Marquardt step on density and held positions; the damping rises until the objective falls.
 
     movable : (m,) tets whose density may change; None for all
+    least_promise : share of the objective by which the model has to see it fall for a step to be tried
     """
     value = evaluate(equilibria, weights, L, design)
     model = build_model(equilibria, weights, L, design)
     for attempt in range(tries):
         damped = model.damped(damping, equilibria.problem.volume_fractions)
         drho = _density_step(damped, design.rho, movable)
-        trial = _trial(equilibria, model, design, drho, damped.held_step(drho))
+        dc = damped.held_step(drho)
+        # The model falls by this at most: its quadratic part takes some of it back.
+        promised = -float(model.gradient_rho @ drho + model.gradient_c @ dc.ravel())
+        if promised < least_promise * value:
+            break
+        trial = _trial(equilibria, model, design, drho, dc)
         if trial is not None:
             new = evaluate(equilibria, weights, L, trial)
             if new < value:

@@ -30,6 +30,9 @@ ROUNDING_LOSS = 2.5
 DEARER = 0.86
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
+# A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
+# that promises less than the second.
+SLOW_REFIT, LEAST_PROMISE, REFIT_TRIES = 1e-2, 1e-3, 12
 # The smallest number of points is looked for from here.
 FIRST_COUNT = 4
 
@@ -233,28 +236,16 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
     done = replace(at, phase=Phase.RELAX, exchanges=EXCHANGED, slow=0)
     if shape_error(at.equilibria.problem, at.design.final.y).rms <= GOOD_ENOUGH * weights.error_scale:
         return done
-    model = build_model(at.equilibria, weights, L, at.design)
-    found = exchanged(at.equilibria, weights, model, at.design, at.patch_radius)
-    if found is None:
-        return done
-    equilibria, design = found
-    damping = FIRST_DAMPING
-    for _ in range(STEPS_AFTER_EXCHANGE):
-        step = gauss_newton_step(equilibria, weights, L, design, damping)
-        design, damping = step.design, step.damping
-    if evaluate(equilibria, weights, L, design) > evaluate(at.equilibria, weights, L, at.design):
-        return done
-    return replace(
-        at,
-        equilibria=equilibria,
-        design=design,
-        phase=Phase.RELAX,
-        damping=damping,
-        iteration=0,
-        slow=0,
-        exchanges=at.exchanges + 1,
-        accepted=True,
-    )
+    model, value = build_model(at.equilibria, weights, L, at.design), evaluate(at.equilibria, weights, L, at.design)
+    for equilibria, moved in exchanged(at.equilibria, weights, model, at.design, at.patch_radius):
+        design, damping = moved, FIRST_DAMPING
+        for _ in range(STEPS_AFTER_EXCHANGE):
+            step = gauss_newton_step(equilibria, weights, L, design, damping)
+            design, damping = step.design, step.damping
+        if evaluate(equilibria, weights, L, design) < value:
+            after = replace(at, equilibria=equilibria, design=design, phase=Phase.RELAX, damping=damping)
+            return replace(after, iteration=0, slow=0, exchanges=at.exchanges + 1, accepted=True)
+    return done
 
 
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
@@ -292,9 +283,12 @@ def undecided_fraction(rho: FloatArray) -> float:
 # -- refit
 
 
-def change_density(equilibria: Equilibria, design: Design, rho: FloatArray) -> Design:
+def change_density(
+    equilibria: Equilibria, design: Design, rho: FloatArray, smallest: float = 1e-3, stay: bool = False
+) -> Design:
     """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
 
+    smallest : share of the way that a step may come down to        stay : see `newton`
     Raises EquilibriumError when the path ends before.
     """
     start, done, step = design.rho, 0.0, 1.0
@@ -302,12 +296,13 @@ def change_density(equilibria: Equilibria, design: Design, rho: FloatArray) -> D
     while done < 1.0:
         aim = min(1.0, done + step)
         mixed = start + aim * (rho - start)
-        trial = equilibrate(equilibria, mixed, held, design.median.x, design.median.forces, design.final.y)
+        x, forces, y = design.median.x, design.median.forces, design.final.y
+        trial = equilibrate(equilibria, mixed, held, x, forces, y, stay=stay)
         if trial is not None:
             design, done, step = trial, aim, 2 * step
         else:
             step /= 2
-        if step < 1e-3:
+        if step < smallest:
             msg = "the printed labels have no equilibrium near that of the relaxed design"
             raise EquilibriumError(msg)
     return design
@@ -323,10 +318,10 @@ def refit(
     fixed = np.zeros(problem.n_tets, bool)
     damping, value = FIRST_DAMPING, evaluate(equilibria, weights, L, design)
     for _ in range(iterations):
-        step = gauss_newton_step(equilibria, weights, L, design, damping, movable=fixed, tries=12)
+        step = gauss_newton_step(equilibria, weights, L, design, damping, fixed, REFIT_TRIES, LEAST_PROMISE)
         if not step.accepted:
             break
-        slow = step.value > (1 - 1e-2) * value
+        slow = step.value > (1 - SLOW_REFIT) * value
         design, damping, value = step.design, step.damping, step.value
         watch(Search(equilibria, design, phase=Phase.DONE))
         if slow:

@@ -67,6 +67,12 @@ class SingularMatrixError(ArithmeticError):
     """A pivot vanished: the matrix has no inverse."""
 
 
+def usable_cores() -> int:
+    """The cores that this process may run on, where the system says so, or else all."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
 def analyse(indptr: IntArray, indices: IntArray, backend: str | None = None) -> Analysis:
     """Symbolic factorisation of the symmetric matrix whose lower triangle has this CSC structure.
 
@@ -210,7 +216,7 @@ class _RslabAnalysis:
 
         n = len(indptr) - 1
         pattern = csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n))
-        usual = (os.cpu_count() or 1) if n >= THREADED_FROM else 1
+        usual = usable_cores() if n >= THREADED_FROM else 1
         self._symbolic = rslab.analyze(pattern, path="ldlt", threads=threads or usual)
         self._structure = indptr, indices
         self._scaling = _Scaling(indptr, indices)

@@ -1,13 +1,23 @@
 """Exchanging points: the linear model against differences, and a point that is missing found."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bars import TIGHT, bar, corner, held_design, mixed_density
 
+from fab4d.design import exchange, reduced
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.exchange import _separate_patches, _shape_by_force, exchanged, force_model, worst_centers
+from fab4d.design.exchange import (
+    _separate_patches,
+    _shape_by_force,
+    better_points,
+    candidate_centers,
+    exchanged,
+    force_model,
+    worst_centers,
+)
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import Design, Model, build_model
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
@@ -65,9 +75,7 @@ def test_the_shape_follows_a_force_as_the_model_says() -> None:
 def test_a_point_goes_where_it_helps(bent: tuple[Equilibria, Design]) -> None:
     equilibria, design = bent
     problem = equilibria.problem
-    result = exchanged(equilibria, WEIGHTS, model_at(equilibria, design), design, RADIUS)
-    assert result is not None
-    other, after = result
+    other, after = next(exchanged(equilibria, WEIGHTS, model_at(equilibria, design), design, RADIUS))
     assert other.patches.count == 2
     assert set(other.patches.centers.tolist()) != set(equilibria.patches.centers.tolist())
     # The other forces have gone to exactly zero: the shapes are in equilibrium with the points' forces alone.
@@ -91,6 +99,39 @@ def test_the_step_keeps_an_exchange_only_where_the_objective_falls(bent: tuple[E
     assert after < 0.8 * before
     lax = replace(settings, weights=WEIGHTS.replace(error_scale=1.0))
     assert exchange_step(start, lax, L).equilibria is equilibria
+
+
+def test_another_exchange_is_tried_where_the_first_comes_to_nothing(
+    bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    equilibria, design = bent
+    L, weights = smoothness_matrix(equilibria.problem), WEIGHTS
+    good = next(exchanged(equilibria, weights, model_at(equilibria, design), design, RADIUS))
+    nowhere = held_at(equilibria.problem, (0.3, 0.0, 0.0), (0.3, 1.0, 0.0))
+    bad = nowhere, held_design(nowhere, design.rho, equilibria.problem.body.X)
+    start = Search(equilibria, design, RADIUS, Phase.EXCHANGE)
+    for offered, expected in (([bad, good], good[0]), ([bad], equilibria), ([], equilibria)):
+        monkeypatch.setattr(reduced, "exchanged", lambda *_, offered=offered: iter(offered))
+        assert exchange_step(start, ReducedSettings(2, (RADIUS,), weights), L).equilibria is expected
+
+
+def test_each_further_exchange_promises_more(bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the tolerance is missed, an exchange that promises little is better than none."""
+    equilibria, design = bent
+    problem = equilibria.problem
+    centers = candidate_centers(problem, equilibria.patches, shape_error(problem, design.final.y).e, RADIUS)
+    candidates = _separate_patches(problem, centers, RADIUS)
+    forces = force_model(equilibria, WEIGHTS, model_at(equilibria, design), design, candidates)
+    better = better_points(forces, 2)
+    values = [forces.without([0, 1], [])]
+    values += [forces.without(points, sorted({0, 1} - set(points))) for points in better]
+    assert len(better) > 0
+    assert all(after < 0.99 * before for before, after in itertools.pairwise(values))
+    assert all(len(set(a) - set(b)) == 1 for a, b in itertools.pairwise([[0, 1], *better]))
+    monkeypatch.setattr(exchange, "LEAST_GAIN", 1.0)  # no exchange gains everything
+    assert better_points(forces, 2) == better
+    H, gradient, ridge = (term / forces.value for term in (forces.H, forces.gradient, forces.ridge))
+    assert better_points(replace(forces, H=H, gradient=gradient, value=1.0, ridge=ridge), 2) == []
 
 
 def test_the_model_knows_what_the_held_points_do(bent: tuple[Equilibria, Design]) -> None:

@@ -1,16 +1,19 @@
 """Flipping labels after rounding: sensitivities against differences, and known labels found again."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bars import TIGHT, bar, held_design, two_patches
 
+from fab4d.design import flips
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import ErrorModes, FlipSettings, at_interface, choose_flips, error_modes, polish_labels
 from fab4d.design.gauss_newton import Design, build_model, equilibrate, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.problem import Problem
+from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3)
@@ -104,6 +107,23 @@ def test_nothing_is_flipped_at_the_target_or_where_nothing_may_be() -> None:
         np.testing.assert_array_equal(same.rho, design.rho)
 
 
+def test_fewer_flips_are_tried_where_many_have_no_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = bar(degrees=30.0)
+    equilibria, tried = two_patches(problem), []
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+
+    def lost(at: Equilibria, before: Design, rho: np.ndarray, smallest: float, stay: bool) -> Design:  # noqa: ARG001
+        tried.append(int(np.abs(rho - before.rho).sum()))
+        msg = "none"
+        raise EquilibriumError(msg)
+
+    monkeypatch.setattr(flips, "change_density", lost)
+    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    assert same is design
+    assert 1 < len(tried) < 5
+    assert all(after < before for before, after in itertools.pairwise(tried))
+
+
 def test_a_part_without_smp_is_left_as_it_is() -> None:
     """It comes back to its permanent shape wherever it is held, and has no interface."""
     problem = bar(degrees=30.0)
@@ -118,9 +138,9 @@ def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
     equilibria, smp = two_patches(problem), upper_half(problem)
     design = held_design(equilibria, smp.astype(float), problem.X_temp)
     modes, factors = modes_at(equilibria, design), np.array([0.3, 1.0])
-    flips = choose_flips(problem, modes, design.rho, factors, FREELY, 30)
-    assert len(flips)
-    assert at_interface(problem, smp)[flips].all()
-    assert not smp[flips].all()
+    chosen = choose_flips(problem, modes, design.rho, factors, FREELY, 30)
+    assert len(chosen)
+    assert at_interface(problem, smp)[chosen].all()
+    assert not smp[chosen].all()
     full = FlipSettings(FREELY.printable, FREELY.flippable, target_rms=0.0, max_smp_fraction=0.0)
     assert smp[choose_flips(problem, modes, design.rho, factors, full, 30)].all()

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from bars import CARD, CLAMPED, bar, held_design, two_patches
 
+from fab4d.design import gauss_newton
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, held_positions
-from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import outward_normals
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import (
@@ -183,6 +184,31 @@ def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
     np.testing.assert_allclose(
         equilibria.patches.mean(found.median.x), equilibria.patches.mean(true.median.x), atol=1e-5
     )
+
+
+def test_a_fit_at_its_best_tries_nothing(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = refit(truth.equilibria, truth.design, WEIGHTS, lambda at: None, 30)  # noqa: ARG005
+    monkeypatch.setattr(gauss_newton, "_trial", lambda *_: pytest.fail("a trial"))
+    weights = WEIGHTS.replace(error_scale=1e3 * rms(truth.problem, found) + 1e-9)
+    L, fixed = smoothness_matrix(truth.problem), np.zeros(truth.problem.n_tets, bool)
+    step = gauss_newton.gauss_newton_step(truth.equilibria, weights, L, found, 0.3, fixed, 12, 1e-3)
+    assert not step.accepted
+    assert step.design is found
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1.0, 1e4])
+def test_no_step_gains_more_than_it_promises(truth: Truth, damping: float) -> None:
+    """The promise bounds what the quadratic model gains: a step that has to gain that much is not tried."""
+    equilibria, design = truth.equilibria, truth.design
+    L, weights = smoothness_matrix(truth.problem), WEIGHTS.replace(error_scale=0.1)
+    step = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, tries=1)
+    value = gauss_newton.evaluate(equilibria, weights, L, design)
+    assert step.accepted
+    share = (value - step.value) / value
+    again = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 0.4 * share)
+    never = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 2.5 * share)
+    assert again.accepted
+    assert not never.accepted
 
 
 def test_fewer_smp_is_used_when_the_goal_says_so(truth: Truth, searched: list[Search]) -> None:

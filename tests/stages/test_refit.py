@@ -11,7 +11,9 @@ from shapes.boxes import box
 from shapes.warps import Turn, ramp, rod, warped
 
 from fab4d.design.equilibria import Equilibria
+from fab4d.design.flips import FlipSettings
 from fab4d.design.forward import balance, program, same_shape
+from fab4d.design.gauss_newton import Design
 from fab4d.io.cards import load_material, load_printer, load_rig
 from fab4d.io.scene import Acceptance, Goal, SolverSettings, Weights
 from fab4d.mesh.rigid import best_rigid_motion
@@ -99,3 +101,17 @@ def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts])
     mesh, smp = inputs["mesh"], fitted[1]["labels"]["smp"]
     again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), PROFILE["printer"])
     np.testing.assert_array_equal(again.smp, smp)
+
+
+def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    targets = []
+
+    def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001
+        targets.append(settings.target_rms * equilibria.problem.length)
+        return design
+
+    monkeypatch.setattr(refit, "polish_labels", spy)
+    refit.run(inputs, PROFILE, SilentMonitor())
+    assert targets == [pytest.approx(1.15 * float(inputs["relaxed"]["relaxed_rms"]))]
