@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors t
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
+# Steps on more tets than this take minutes: they are rounded in about half the steps.
+MANY_TETS, FAST_GROWTH = 60_000, 2.5
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
 # attempts as many times more.
 RELAXED_SHARE = 0.6
@@ -211,12 +214,13 @@ def search_settings(
     rig: RigCard = profile["rig"]
     weights = objective_weights(problem, goal, profile["weights"], rig, profile["materials"])
     smooth, smp = ATTEMPTS[attempt]
-    return ReducedSettings(
+    settings = ReducedSettings(
         n_points=most_points(goal, rig) if n_points is None else n_points,
         patch_radii=tuple(radius / problem.length for radius in rig.patch_radii),
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )
+    return replace(settings, round_growth=FAST_GROWTH) if problem.n_tets > MANY_TETS else settings
 
 
 def _artifacts(found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A mesh for stages that need one, a monitor with a memory, and a way to the shapes of `samples/`."""
+"""A mesh for stages that need one, a monitor with a memory, and a way to bent_bar.py and the shapes of `samples/`."""
 
 import sys
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ import pytest
 from fab4d.mesh.measures import tet_volumes
 from fab4d.stages.monitor import SilentMonitor
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "samples"))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / "samples")]
 
 
 class Memory(SilentMonitor):

@@ -2,20 +2,18 @@
 
 import csv
 import io
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from shapes.boxes import box
-from shapes.warps import Turn, ramp, rod, warped
+from bent_bar import PROFILE as BENT_BAR
+from bent_bar import bent_bar
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings
 from fab4d.design.forward import balance, program, same_shape
 from fab4d.design.gauss_newton import Design
-from fab4d.io.cards import load_material, load_printer, load_rig
-from fab4d.io.scene import Acceptance, Goal, SolverSettings, Weights
+from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages import refit, solve, threshold
@@ -24,27 +22,15 @@ from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.threshold import labels_for
 
-SIZE = (60.0, 12.0, 8.0)
-PROFILE = {
-    "materials": load_material("paper-corrected", Path()),
-    "printer": load_printer("generic-dual-0.4", Path()),
-    "rig": load_rig("bench", Path()),
-    "weights": Weights(),
-    "solver": SolverSettings(element="linear"),
-    "goal": Goal(tolerance=0.8, max_forces=4),
-    "acceptance": Acceptance(),
-}
+PROFILE = BENT_BAR | {"goal": Goal(tolerance=0.8, max_forces=4)}
 
 Artifacts = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def inputs() -> Artifacts:
-    """A bar of 10 x 2 x 2 cells, clamped at its left end, that wants to be bent by 40 degrees, designed and rounded."""
-    X, tets = box(SIZE, (10, 2, 2), "five")
-    line = rod((8.0, SIZE[1] / 2, SIZE[2] / 2), (SIZE[0], SIZE[1] / 2, SIZE[2] / 2), (0, 0, 1))
-    bent = warped(X, line, (Turn((0, 0, 1), 40.0, lambda s: ramp(s, 0, 5)),))
-    mesh = {"X": X, "X_temp": bent, "tets": tets, "clamp": X[:, 0] <= 8.0}
+    """A bar that wants to be bent by 40 degrees, designed and rounded."""
+    mesh = bent_bar((10, 2, 2), 40.0)
     given = {"mesh": mesh, "check_report": {"nothing_to_program": False}, "picked": None}
     relaxed = solve.run(given, PROFILE, SilentMonitor())["relaxed"]
     rounded = threshold.run({"mesh": mesh, "relaxed": relaxed}, PROFILE, SilentMonitor())["rounded"]

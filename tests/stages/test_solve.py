@@ -1,36 +1,23 @@
 """The stage solve: how many points it takes, and what it says where a goal is out of reach."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from shapes.boxes import box
-from shapes.warps import Turn, ramp, rod, warped
+from bent_bar import PROFILE, bent_bar
 
-from fab4d.io.cards import load_material, load_printer, load_rig
-from fab4d.io.scene import Goal, SolverSettings, Weights
+from fab4d.io.scene import Goal
+from fab4d.stages import solve
+from fab4d.stages._design import problem_of
 from fab4d.stages.monitor import SilentMonitor
-from fab4d.stages.solve import run
-
-SIZE = (60.0, 12.0, 8.0)
-PROFILE = {
-    "materials": load_material("paper-corrected", Path()),
-    "printer": load_printer("generic-dual-0.4", Path()),
-    "rig": load_rig("bench", Path()),
-    "weights": Weights(),
-    "solver": SolverSettings(element="linear"),
-}
+from fab4d.stages.solve import run, search_settings
 
 
 @pytest.fixture(scope="module")
 def bar() -> dict[str, np.ndarray]:
-    """A bar clamped at its left end that wants to be bent by 50 degrees."""
-    X, tets = box(SIZE, (7, 1, 1), "five")
-    line = rod((8.0, SIZE[1] / 2, SIZE[2] / 2), (SIZE[0], SIZE[1] / 2, SIZE[2] / 2), (0, 0, 1))
-    bent = warped(X, line, (Turn((0, 0, 1), 50.0, lambda s: ramp(s, 0, 5)),))
-    return {"X": X, "X_temp": bent, "tets": tets, "clamp": X[:, 0] <= 8.0}
+    """Clamped at its left end, to be bent by 50 degrees."""
+    return bent_bar((7, 1, 1), 50.0)
 
 
 def solved(mesh: dict[str, np.ndarray], goal: Goal, **profile: Any) -> dict[str, Any]:
@@ -60,3 +47,14 @@ def test_a_goal_out_of_reach_says_what_limits_it(bar: dict[str, np.ndarray]) -> 
     weak = replace(PROFILE["rig"], max_force=20.0)
     report = solved(bar, Goal(tolerance=0.02, max_forces=1), rig=weak)["solve_report"]
     assert report["limited_by"].startswith("the largest force of the rig")
+
+
+def test_very_fine_meshes_are_rounded_in_fewer_steps(
+    bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, profile = problem_of(bar, PROFILE["materials"], "linear"), PROFILE | {"goal": Goal(max_forces=3)}
+    usual = search_settings(problem, profile)
+    monkeypatch.setattr(solve, "MANY_TETS", problem.n_tets - 1)
+    fast = search_settings(problem, profile)
+    assert fast.round_growth > 2 > usual.round_growth
+    assert replace(fast, round_growth=usual.round_growth) == usual
