@@ -23,20 +23,20 @@ from fab4d.runner.workspace import Workspace
 # Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
 # A power below zero, noise of the runs, is taken as zero.
 STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (0.905, 0.25),
-    "solve": (14.3, 0.79),
-    "threshold": (0.0915, 0.79),
-    "refit": (15, 0.34),
-    "verify": (5.19, 0.50),
-    "sensitivity": (3.78, 0.63),
-    "judge": (0.0176, 0.44),
-    "bodies": (0.679, 0.36),
-    "slice": (1.36, 0.68),
-    "rig": (0.416, 0.25),
-    "report": (0.429, 0.19),
+    "check": (1.34, 0.15),
+    "solve": (18.1, 0.67),
+    "threshold": (0.11, 0.74),
+    "refit": (12.1, 0.15),
+    "verify": (5.63, 0.43),
+    "sensitivity": (4.45, 0.53),
+    "judge": (0.0236, 0.27),
+    "bodies": (0.978, 0.12),
+    "slice": (1.8, 0.54),
+    "rig": (0.502, 0.10),
+    "report": (0.512, 0.10),
 }
 # Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (617, 16)
+MEMORY_MB = (607, 13.5)
 
 
 def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[str, Any]) -> list[str]:
