@@ -229,7 +229,7 @@ def gauss_newton_step(
     """One Levenberg-Marquardt step on density and held positions; the damping rises until the objective falls.
 
     movable : (m,) tets whose density may change; None for all
-    least_promise : share of the objective by which the model has to see it fall for a step to be tried
+    least_promise : share of the objective by which the model has to see it fall for a step to be worth its equilibria
     """
     value = evaluate(equilibria, weights, L, design)
     model = build_model(equilibria, weights, L, design)
@@ -239,9 +239,7 @@ def gauss_newton_step(
         dc = damped.held_step(drho)
         # The model falls by this at most: its quadratic part takes some of it back.
         promised = -float(model.gradient_rho @ drho + model.gradient_c @ dc.ravel())
-        if promised < least_promise * value:
-            break
-        trial = _trial(equilibria, model, design, drho, dc)
+        trial = _trial(equilibria, model, design, drho, dc) if promised > least_promise * value else None
         if trial is not None:
             new = evaluate(equilibria, weights, L, trial)
             if new < value:

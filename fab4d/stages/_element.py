@@ -12,8 +12,8 @@ from fab4d.stages._design import problem_of
 
 # Bars of 8 linear tets across bend to 0.87 of the true flexibility (model.md section 5): forces are at most 15 % large.
 FINE_ELEMENTS = 8.0
-# More unknowns take longer than a design is worth: at 34,000 a factorisation takes 0.7 s, and rounding, fit,
-# verification and sensitivities take some 800 of them.
+# More unknowns take longer than a design is worth: rounding, fit, verification and sensitivities take some 800
+# factorisations, and many times more back-substitutions.
 MOST_QUADRATIC_DOFS = 32_000
 
 

@@ -28,7 +28,7 @@ from fab4d.stages.threshold import labels_for
 # How often the held positions are fitted again after the loading has found another equilibrium than the fit.
 MOST_FITS = 3
 # Labels are flipped until the error is at most this multiple of that of the relaxed design.
-ROUNDING_LOSS = 1.15
+ALLOWED_LOSS = 1.15
 Polish = Callable[[Design], Design]
 
 
@@ -104,7 +104,7 @@ def _polish(
     trace: Trace,
 ) -> Callable[[Design], Design]:
     """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    target_rms = ROUNDING_LOSS * float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
+    target_rms = ALLOWED_LOSS * float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], target_rms)
     return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
 

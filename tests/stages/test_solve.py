@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from bent_bar import PROFILE, bent_bar
 
-from fab4d.io.scene import Goal
+from fab4d.design.problem import Problem
+from fab4d.design.reduced import Search, at_rest
+from fab4d.io.scene import Goal, SolverSettings
 from fab4d.stages import solve
 from fab4d.stages._design import problem_of
 from fab4d.stages.monitor import SilentMonitor
@@ -58,3 +60,19 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
     assert replace(fast, round_growth=usual.round_growth) == usual
+
+
+def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
+    bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where quadratic tets need more SMP than the goal allows, the labels of the linear ones are handed on."""
+    quadratic = SolverSettings(element="quadratic")
+
+    def all_smp(problem: Problem, relaxed: Search, *_: Any) -> Search:
+        rest = at_rest(problem)
+        return replace(rest, design=replace(rest.design, rho=np.ones(problem.n_tets)), relaxed_rms=relaxed.relaxed_rms)
+
+    monkeypatch.setattr(solve, "rounded_in", all_smp)
+    for most, kept in ((None, True), (0.9, False)):
+        found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=quadratic)["relaxed"]
+        assert (len(found["x"]) > len(bar["X"])) == kept
