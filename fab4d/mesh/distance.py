@@ -23,6 +23,14 @@ class ShapeError:
     hausdorff: float
 
 
+@dataclass(frozen=True)
+class Displacement:
+    """RMS and largest distance of boundary vertices from the permanent to the wanted shape, in the unit of these."""
+
+    rms: float
+    max: float
+
+
 class BoxTree(NamedTuple):
     """Axis-parallel boxes around the triangles of a surface, a complete binary tree stored as a heap."""
 
@@ -50,6 +58,19 @@ def shape_error(y: FloatArray, X_temp: FloatArray, faces: IntArray, vertex_areas
         max=float(np.sqrt(squared.max())),
         hausdorff=hausdorff_distance(moved, X_temp, faces),
     )
+
+
+def prescribed_displacement(
+    X: FloatArray, X_temp: FloatArray, vertices: IntArray, weights: FloatArray, clamped: bool
+) -> Displacement:
+    """How far the wanted shape X_temp (n, 3) is from the permanent one X at the boundary vertices (k,).
+
+    weights : (k,) areas of the vertices        clamped : whether the part has a clamp, whose frame counts then; of a
+    part without one the best rigid motion is taken out
+    """
+    start = X if clamped else aligned(X, X_temp, vertices, weights)
+    squared = np.sum((X_temp[vertices] - start[vertices]) ** 2, axis=1)
+    return Displacement(float(np.sqrt(weights @ squared / weights.sum())), float(np.sqrt(squared.max())))
 
 
 def aligned(y: FloatArray, target: FloatArray, vertices: IntArray, weights: FloatArray) -> FloatArray:

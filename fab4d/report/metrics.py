@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 
 from fab4d.materials.cards import MaterialCard
-from fab4d.mesh.distance import ShapeError, aligned, aligned_hausdorff_distance, shape_error
+from fab4d.mesh.distance import (
+    Displacement,
+    ShapeError,
+    aligned,
+    aligned_hausdorff_distance,
+    prescribed_displacement,
+    shape_error,
+)
 from fab4d.mesh.measures import bounding_box_diagonal, tet_volumes, vertex_areas
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
@@ -32,14 +39,6 @@ class Shapes:
         return np.unique(self.faces)
 
 
-@dataclass(frozen=True)
-class Displacement:
-    """RMS and largest distance of boundary vertices from the permanent to the wanted shape, mm."""
-
-    rms: float
-    max: float
-
-
 def shapes_of(mesh: Mapping[str, np.ndarray], state: Mapping[str, np.ndarray] | None) -> Shapes:
     """The shapes of a verified state; without one (nothing to program) the part stays as printed."""
     X, faces = mesh["X"], face_table(mesh["tets"]).boundary
@@ -61,14 +60,9 @@ def final_as_wanted(shapes: Shapes) -> FloatArray:
 
 
 def target_displacement(shapes: Shapes) -> Displacement:
-    """How far the wanted shape is from the permanent one, area-weighted over boundary vertices.
-
-    In the frame of the clamp; for a part without one after the best rigid motion.
-    """
-    on, a = shapes.surface, shapes.areas[shapes.surface]
-    X = shapes.X if shapes.clamped else aligned(shapes.X, shapes.X_temp, on, a)
-    squared = np.sum((shapes.X_temp[on] - X[on]) ** 2, axis=1)
-    return Displacement(float(np.sqrt(a @ squared / a.sum())), float(np.sqrt(squared.max())))
+    """How far the wanted shape is from the permanent one, mm: `mesh.distance.prescribed_displacement`."""
+    on = shapes.surface
+    return prescribed_displacement(shapes.X, shapes.X_temp, on, shapes.areas[on], shapes.clamped)
 
 
 def fixity(shapes: Shapes) -> float | None:

@@ -10,8 +10,9 @@ ACCEPTED, REJECTED = "ACCEPTED", "REJECTED"
 ERROR_CHECK = "RMS error"
 LARGEST_RESIDUAL = 1e-8
 """Largest residual of an equilibrium, relative to the largest force."""
-DEFAULT_TOLERANCE = 5e-3
-"""Largest RMS error when the scene states none, relative to the diagonal."""
+DEFAULT_TOLERANCE, DEFAULT_SHARE, LEAST_TOLERANCE = 5e-3, 0.1, 1e-4
+"""When the scene states no largest RMS error: parts of the diagonal and of the prescribed displacement, and the part of
+the diagonal below which no printer works."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,14 @@ class Limits:
     max_smp_fraction: float | None
     max_ambiguous_fraction: float
     max_isolated_fraction: float
+
+
+def default_tolerance(diagonal: float, prescribed: float) -> float:
+    """The largest RMS error of a scene that states none.
+
+    diagonal : of the part        prescribed : RMS displacement from the permanent to the temporary shape, same unit
+    """
+    return max(min(DEFAULT_TOLERANCE * diagonal, DEFAULT_SHARE * prescribed), LEAST_TOLERANCE * diagonal)
 
 
 def checks_of(figures: Mapping[str, Any], limits: Limits) -> list[Check]:

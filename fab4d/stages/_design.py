@@ -15,12 +15,11 @@ from fab4d.fabrication.labels import ambiguous_fraction
 from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.materials.cards import MaterialCard
-from fab4d.mesh.distance import shape_error
+from fab4d.mesh.distance import prescribed_displacement, shape_error
 from fab4d.mesh.measures import vertex_areas
+from fab4d.report.verdict import default_tolerance
 from fab4d.stages.monitor import Monitor
 
-# The largest RMS distance, relative to the diagonal, that a goal without a tolerance means.
-DEFAULT_TOLERANCE = 5e-3
 # Price of SMP and of a rough interface, in units of the squared error at the tolerance. Rough interfaces are pinched in
 # many places, and repairing these costs more accuracy than a smooth one does from the start.
 LAM_SMP, LAM_SMOOTH = 0.05, 2.5
@@ -37,7 +36,7 @@ def objective_weights(
     problem: Problem, goal: Goal, weights: Weights, rig: RigCard, materials: MaterialCard
 ) -> ObjectiveWeights:
     """Weights of the objective: the scene's, or else those that count an error of the goal's tolerance as 1."""
-    tolerance = DEFAULT_TOLERANCE if goal.tolerance is None else goal.tolerance / problem.length
+    tolerance = _usual_tolerance(problem) if goal.tolerance is None else goal.tolerance / problem.length
     return ObjectiveWeights(
         error_scale=tolerance if weights.lam_pfinal is None else weights.lam_pfinal**-0.5,
         lam_SMP=LAM_SMP if weights.lam_SMP is None else weights.lam_SMP,
@@ -48,6 +47,13 @@ def objective_weights(
         smp_max_stretch=LIMIT_MARGIN * materials.smp_max_stretch,
         tpe_max_stretch=LIMIT_MARGIN * materials.tpe_max_stretch,
     )
+
+
+def _usual_tolerance(problem: Problem) -> float:
+    """That of a goal without one, in L0."""
+    on, a = np.flatnonzero(problem.area_weights), problem.area_weights
+    moved = prescribed_displacement(problem.body.X, problem.X_temp, on, a[on], bool(problem.clamp.any()))
+    return default_tolerance(1.0, moved.rms)
 
 
 def patch_arrays(problem: Problem, patches: Patches, design: Design) -> dict[str, np.ndarray]:

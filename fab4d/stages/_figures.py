@@ -9,7 +9,7 @@ from fab4d.io.scene import Acceptance, Goal, RigCard
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.measures import bounding_box_diagonal
 from fab4d.report import metrics
-from fab4d.report.verdict import DEFAULT_TOLERANCE, Limits
+from fab4d.report.verdict import Limits, default_tolerance
 
 
 def printed_labels(inputs: Mapping[str, Any]) -> np.ndarray:
@@ -18,10 +18,11 @@ def printed_labels(inputs: Mapping[str, Any]) -> np.ndarray:
     return np.zeros(len(inputs["mesh"]["tets"]), bool) if labels is None else labels["smp"].astype(bool)
 
 
-def limits_of(goal: Goal, acceptance: Acceptance, rig: RigCard, L0: float) -> Limits:
-    """What the scene asks for; L0: diagonal of the part, mm."""
+def limits_of(goal: Goal, acceptance: Acceptance, rig: RigCard, shapes: metrics.Shapes) -> Limits:
+    """What the scene asks for."""
+    usual = default_tolerance(bounding_box_diagonal(shapes.X), metrics.target_displacement(shapes).rms)
     return Limits(
-        tolerance=DEFAULT_TOLERANCE * L0 if goal.tolerance is None else goal.tolerance,
+        tolerance=usual if goal.tolerance is None else goal.tolerance,
         max_forces=rig.max_points if goal.max_forces is None else goal.max_forces,
         max_smp_fraction=goal.max_smp_fraction,
         max_ambiguous_fraction=acceptance.max_ambiguous_fraction,

@@ -12,6 +12,7 @@ from fab4d.io.meshes import RawMesh
 from fab4d.io.scene import ClampRegion, Goal
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.compatibility import compare_tets, has_repeated_vertex, same_degrees
+from fab4d.mesh.distance import prescribed_displacement
 from fab4d.mesh.doctor import (
     COINCIDENT,
     Pair,
@@ -27,11 +28,11 @@ from fab4d.mesh.doctor import (
 )
 from fab4d.mesh.findings import Finding, finding, named
 from fab4d.mesh.grid import snapped
-from fab4d.mesh.measures import deformation_gradients, tet_volumes
+from fab4d.mesh.measures import deformation_gradients, tet_volumes, vertex_areas
 from fab4d.mesh.quality import largest_stretches, min_dihedral_angles, vertex_components
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.mesh.topology import face_table
-from fab4d.report.verdict import DEFAULT_TOLERANCE
+from fab4d.report.verdict import default_tolerance
 from fab4d.stages._advice import clamp_findings, fewest_points, point_findings, suggested_clamp, travel_findings
 from fab4d.stages._target import Target, reachable_target
 from fab4d.stages.monitor import Monitor
@@ -65,7 +66,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     nothing_to_program, found = check_motion(pair, clamp)
     findings += [*_refuse(found), *_refuse(check_boundary(pair, clamp))]
     target, suggested, fewest = Target(pair, []), None, 0
-    tolerance = _tolerance(profile["goal"], pair)
+    tolerance = _tolerance(profile["goal"], pair, clamp)
     if not nothing_to_program:
         monitor.progress("target")
         target = reachable_target(pair, clamp, profile["materials"], tolerance)
@@ -113,8 +114,13 @@ def _outlook(
     return fewest, found
 
 
-def _tolerance(goal: Goal, pair: Pair) -> float:
-    return DEFAULT_TOLERANCE * pair.diagonal if goal.tolerance is None else goal.tolerance
+def _tolerance(goal: Goal, pair: Pair, clamp: BoolArray) -> float:
+    if goal.tolerance is not None:
+        return goal.tolerance
+    faces = face_table(pair.tets).boundary
+    on = np.unique(faces)
+    moved = prescribed_displacement(pair.X, pair.X_temp, on, vertex_areas(pair.X, faces)[on], bool(clamp.any()))
+    return default_tolerance(pair.diagonal, moved.rms)
 
 
 def _arrays(target: Target, clamp: BoolArray) -> dict[str, np.ndarray]:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from fab4d.io.meshes import vtu_bytes
-from fab4d.mesh.measures import bounding_box_diagonal
 from fab4d.report import metrics
 from fab4d.report.page import report_page, view_data
 from fab4d.report.trace import joined_trace, trace_csv, trace_plot
@@ -39,7 +38,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     monitor.progress("figures")
     mesh, state, smp = inputs["mesh"], inputs["state"], printed_labels(inputs)
     shapes, reports = metrics.shapes_of(mesh, state), {name: inputs[name] for name in REPORTS}
-    limits = limits_of(profile["goal"], profile["acceptance"], profile["rig"], bounding_box_diagonal(mesh["X"]))
+    limits = limits_of(profile["goal"], profile["acceptance"], profile["rig"], shapes)
     figures = figures_of(inputs, profile["materials"], shapes, smp)
     checks = checks_of(figures, limits)
     reasons = reasons_of(checks, reports)

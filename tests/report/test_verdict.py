@@ -4,7 +4,7 @@ import copy
 
 import pytest
 
-from fab4d.report.verdict import Limits, checks_of, left_out_of, reasons_of
+from fab4d.report.verdict import Limits, checks_of, default_tolerance, left_out_of, reasons_of
 
 LIMITS = Limits(1.5, 8, 0.5, 1e-3, 0.3)
 GOOD = {
@@ -64,3 +64,10 @@ def test_left_out_is_collected_once_in_order():
     gravity, workers = {"what": "gravity", "why": "none given"}, {"what": "workers", "why": "small"}
     reports = {"a": {"left_out": [gravity]}, "b": None, "c": {"left_out": [workers, gravity]}, "d": {}}
     assert left_out_of(reports) == [gravity, workers]
+
+
+def test_the_usual_tolerance_follows_part_and_motion_in_any_unit():
+    assert default_tolerance(200.0, 50.0) == pytest.approx(1.0)
+    assert default_tolerance(200.0, 4.0) == pytest.approx(0.4)
+    assert default_tolerance(200.0, 0.0) == pytest.approx(0.02)
+    assert default_tolerance(0.2, 0.004) == pytest.approx(1e-3 * default_tolerance(200.0, 4.0))

@@ -39,6 +39,13 @@ def test_an_error_above_the_tolerance_is_the_first_reason(mesh):
     assert verdict(mesh, bent(mesh), 50.0)["verdict"] == "ACCEPTED"
 
 
+def test_without_a_tolerance_a_small_motion_has_to_be_made(mesh):
+    """Staying as it is misses all of the prescribed motion, however small that is beside the part."""
+    small = 1e-2 * bent(mesh)
+    assert np.linalg.norm(small, axis=1).max() < 5e-3 * np.linalg.norm(np.ptp(mesh["X"], axis=0))
+    assert verdict(mesh, small)["verdict"] == "REJECTED"
+
+
 @pytest.mark.parametrize("name", [name for name in judge.REPORTS if name != "verify_report"])
 def test_what_an_earlier_stage_says_rejects(mesh, name):
     assert verdict(mesh, 0.0, **{name: {"reasons": ["it leaks"]}})["reasons"] == ["it leaks"]

@@ -9,9 +9,11 @@ from bent_bar import PROFILE, bent_bar
 
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, at_rest
-from fab4d.io.scene import Goal, SolverSettings
+from fab4d.io.scene import Acceptance, Goal, SolverSettings
+from fab4d.report.metrics import shapes_of
 from fab4d.stages import solve
 from fab4d.stages._design import problem_of
+from fab4d.stages._figures import limits_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run, search_settings
 
@@ -49,6 +51,16 @@ def test_a_goal_out_of_reach_says_what_limits_it(bar: dict[str, np.ndarray]) -> 
     weak = replace(PROFILE["rig"], max_force=20.0)
     report = solved(bar, Goal(tolerance=0.02, max_forces=1), rig=weak)["solve_report"]
     assert report["limited_by"].startswith("the largest force of the rig")
+
+
+@pytest.mark.parametrize("share", [1.0, 0.1])
+def test_solver_and_verdict_mean_the_same_by_a_goal_without_a_tolerance(
+    bar: dict[str, np.ndarray], share: float
+) -> None:
+    mesh = bar | {"X_temp": bar["X"] + share * (bar["X_temp"] - bar["X"])}
+    problem, profile = problem_of(mesh, PROFILE["materials"], "linear"), PROFILE | {"goal": Goal()}
+    allowed = limits_of(Goal(), Acceptance(), PROFILE["rig"], shapes_of(mesh, None)).tolerance
+    assert search_settings(problem, profile).weights.error_scale == pytest.approx(allowed / problem.length, rel=1e-12)
 
 
 def test_very_fine_meshes_are_rounded_in_fewer_steps(
