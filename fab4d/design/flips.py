@@ -13,10 +13,11 @@ import numpy as np
 from scipy.linalg import qr
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.gauss_newton import Design, Model, build_model, evaluate
+from fab4d.design.gauss_newton import Design, evaluate
 from fab4d.design.objective import ObjectiveWeights, rigid_modes, shape_error, smoothness_matrix
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, Watch, change_density, refit
+from fab4d.design.sensitivity import linearise
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
@@ -83,7 +84,7 @@ def polish_labels(
     for _ in range(settings.rounds):
         if not batch or poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
             break
-        modes = error_modes(equilibria.problem, build_model(equilibria, plain, L, design), design)
+        modes = error_modes(equilibria, design)
         flips = choose_flips(equilibria.problem, modes, design.rho, factors, settings, batch)
         if not len(flips):
             break
@@ -119,9 +120,9 @@ def _flipped(
 # -- sensitivities
 
 
-def error_modes(problem: Problem, model: Model, design: Design) -> ErrorModes:
-    """Amplitudes of the error of the final shape and their sensitivities, from the model at the design."""
-    error = shape_error(problem, design.final.y)
+def error_modes(equilibria: Equilibria, design: Design) -> ErrorModes:
+    """Amplitudes of the error of the final shape and their sensitivities."""
+    problem, error = equilibria.problem, shape_error(equilibria.problem, design.final.y)
     e = (error.e @ error.R).ravel()
     weights = np.repeat(problem.area_weights, 3)
     outer = np.flatnonzero(weights)
@@ -137,7 +138,8 @@ def error_modes(problem: Problem, model: Model, design: Design) -> ErrorModes:
     basis = basis[:, size > 1e-6 * size[0]]
     directions = np.zeros((len(e), basis.shape[1]))
     directions[outer] = root * basis
-    by_density, by_held = model.lin.adjoint_many(directions)
+    lin = linearise(equilibria, design.rho, design.median, design.final)
+    by_density, by_held = lin.adjoint_many(directions)
     return ErrorModes(directions, directions.T @ e, by_density, by_held)
 
 
@@ -178,6 +180,27 @@ def choose_flips(
         residual = residual + change[best]
         labels[tets[best]], usable[best] = not labels[tets[best]], False
     return np.array(chosen, np.int64)
+
+
+def influence(modes: ErrorModes, rho: FloatArray) -> FloatArray:
+    """(m,) how far another material in each tet alone moves the final shape, held positions following; 1 on average.
+
+    rho : (m,) near 0/1
+    """
+    change, _ = _whole_flips(modes, rho)
+    moved = np.linalg.norm(change, axis=1)
+    return moved / moved.mean() if moved.any() else np.ones(len(rho))
+
+
+def predicted_error(modes: ErrorModes, rho: FloatArray, labels: BoolArray) -> float:
+    """The error, as far as the modes see it, with `labels` (m,) instead of the near 0/1 density rho (m,)."""
+    change, residual = _whole_flips(modes, rho)
+    return float(np.linalg.norm(residual + change[labels != (rho > 0.5)].sum(axis=0)))
+
+
+def _whole_flips(modes: ErrorModes, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
+    to_smp, to_tpe = FIRST_FACTORS
+    return _predicted(modes, np.arange(len(rho)), np.where(rho > 0.5, -to_tpe, to_smp))
 
 
 def _predicted(modes: ErrorModes, tets: IntArray, by: FloatArray) -> tuple[FloatArray, FloatArray]:

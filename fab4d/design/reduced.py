@@ -28,6 +28,8 @@ STEPS_AFTER_EXCHANGE = 2
 ROUNDING_LOSS = 2.5
 # While there is too much SMP, its price grows by this power of the growth of lam_round.
 DEARER = 0.86
+# So many rounding steps in a row that are not taken end it: the equilibria turn unstable on its way.
+MOST_REFUSED = 3
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -66,7 +68,7 @@ class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
     patch_radius : L0        phase : of the next step
-    iteration, slow : steps of this phase, and how many of the last gained little
+    iteration, slow : steps of this phase, and how many of the last gained little, or while rounding nothing
     exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
     """
@@ -95,26 +97,23 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
     """
     L = smoothness_matrix(problem)
-    at = start
-    if at is None:
-        at = first_search(problem, settings)
-        watch(at)
+    at = relaxed(problem, settings, watch, start)
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
         watch(at)
     return at
 
 
-def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch) -> Search:
-    """The best relaxed design: the search from its start as far as rounding.
-
-    Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
-    """
+def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
+    """The best relaxed design: as `solve_reduced`, but only as far as rounding."""
     L = smoothness_matrix(problem)
-    at = first_search(problem, settings)
-    while at.phase in (Phase.RELAX, Phase.EXCHANGE):
+    at = start
+    if at is None:
+        at = first_search(problem, settings)
         watch(at)
+    while at.phase in (Phase.RELAX, Phase.EXCHANGE):
         at = STEPS[at.phase](at, settings, L)
+        watch(at)
     return at
 
 
@@ -249,16 +248,18 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
 
 
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
-    """Raise lam_round until all but a few densities are 0 or 1, held positions following."""
+    """Raise lam_round until all but a few densities are 0 or 1, held positions following, or no step is taken."""
     too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
     lam_SMP = settings.round_growth**DEARER * at.lam_SMP if too_much else at.lam_SMP
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
     scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
     weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
+    slow = 0 if step.accepted else at.slow + 1
     finished = (
         undecided_fraction(step.design.rho) <= settings.undecided_fraction
         or at.iteration + 1 == settings.round_iterations
+        or slow == MOST_REFUSED
     )
     return replace(
         at,
@@ -268,6 +269,7 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
         lam_round=settings.round_growth * at.lam_round,
         damping=min(step.damping, LARGEST_DAMPING),
         iteration=at.iteration + 1,
+        slow=slow,
         accepted=step.accepted,
     )
 

@@ -112,8 +112,9 @@ def _polish(
 def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Goal, target_rms: float) -> FlipSettings:
     """Flips that keep the labels printable and within the goal's share of SMP, down to the RMS error target_rms, L0."""
     X, tets = mesh["X"], mesh["tets"]
+    volumes = np.abs(tet_volumes(X, tets))
     return FlipSettings(
-        printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), printer).smp,
+        printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), volumes, printer).smp,
         flippable=flip_check(tets),
         target_rms=target_rms,
         max_smp_fraction=1.0 if goal.max_smp_fraction is None else goal.max_smp_fraction,

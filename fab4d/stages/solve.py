@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,14 @@ import numpy as np
 from fab4d.design.finish import rounded_in
 from fab4d.design.objective import force_excess, shape_error, stretch_excess
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, solve_reduced
+from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
 from fab4d.errors import SceneError
 from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
+from fab4d.stages._repair import repair_cost
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
 
@@ -28,6 +29,12 @@ LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors t
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
+# A design rounded in the elements of the last fit needs no other, if its RMS error is at most this share of the
+# tolerance: repairs of its labels cost less than the rest. Relaxed designs beyond this multiple of it are not rounded
+# there.
+CERTAINLY_ENOUGH, OUT_OF_REACH = 0.5, 1.25
+NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
+NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
 # Steps on more tets than this take minutes: they are rounded in about half the steps.
 MANY_TETS, FAST_GROWTH = 60_000, 2.5
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
@@ -50,27 +57,44 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         why = [
             {"what": "design, forces and rig sheet", "why": "the temporary shape is the permanent one, moved rigidly"}
         ]
-        return _artifacts(rest, trace, {"tau_s": tau_s, "left_out": why})
+        return _artifacts(mesh, profile, rest, trace, {"tau_s": tau_s, "left_out": why})
     if inputs["picked"] is not None:
-        return _picked(problem, inputs["picked"], trace, tau_s)
-    found, relaxed, attempts, rms = _search(problem, mesh, profile, trace, monitor)
+        return _picked(problem, inputs, profile, trace, tau_s)
+    searched = _search(problem, mesh, profile, trace, monitor)
     least = None
-    settings = search_settings(problem, profile, attempts - 1, found.equilibria.patches.count)
     if profile["goal"].smp == "least":
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
-        least = least_smp(problem, mesh, sections, settings, found, trace, monitor)
-        found, relaxed, rms = least.found, least.relaxed, least.printed_rms
-    finished = _finished(mesh, profile, relaxed, settings, trace)
+        least = least_smp(problem, mesh, sections, searched.settings, searched.found, trace, monitor)
+        finished = _finished(mesh, profile, least.relaxed, searched.settings, trace)
+        searched = replace(searched, found=least.found, printed_rms=least.printed_rms, finished=finished)
+    rms = searched.printed_rms
     report = {
         "tau_s": tau_s,
         "iterations": len(trace.rows),
-        "attempts": attempts,
+        "attempts": searched.attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "least_smp": None if least is None else least.trials,
-        "limited_by": _limited_by(problem, profile, found),
-        "left_out": LEFT_OUT,
+        "limited_by": _limited_by(problem, profile, searched.found),
+        "left_out": LEFT_OUT + searched.left_out,
     }
-    return _artifacts(finished or found, trace, report)
+    return _artifacts(mesh, profile, searched.finished or searched.found, trace, report)
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """What the attempts came to.
+
+    found : the best design, rounded in linear elements, or else still relaxed        settings : of the last attempt
+    printed_rms : RMS error of `found` as printed, L0, inf where it was not judged
+    finished : the last relaxed design, rounded in the elements of the last fit
+    """
+
+    found: Search
+    settings: ReducedSettings
+    attempts: int
+    printed_rms: float
+    finished: Search | None
+    left_out: list[dict[str, str]]
 
 
 def _finished(
@@ -80,10 +104,13 @@ def _finished(
     settings: ReducedSettings,
     trace: Trace,
 ) -> Search | None:
-    """The relaxed design rounded in the elements of the last fit; None where these are linear, lose it on the way or
-    need more SMP than the goal allows."""
+    """The relaxed design rounded in the elements of the last fit.
+
+    None where these are linear, lose it on the way or need more SMP than the goal allows, and where it misses the
+    tolerance by far.
+    """
     element, _ = element_for(mesh, profile["solver"].element)
-    if element == "linear" or relaxed.phase is not Phase.ROUND:
+    if element == "linear" or relaxed.phase is not Phase.ROUND or _far_off(relaxed, settings):
         return None
     problem = problem_of(mesh, profile["materials"], element)
     finished, most = rounded_in(problem, relaxed, settings, trace.add), profile["goal"].max_smp_fraction
@@ -92,12 +119,20 @@ def _finished(
     return finished
 
 
-def _picked(problem: Problem, picked: Mapping[str, np.ndarray], trace: Trace, tau_s: float) -> dict[str, Any]:
+def _far_off(relaxed: Search, settings: ReducedSettings) -> bool:
+    return relaxed.relaxed_rms > OUT_OF_REACH * settings.weights.error_scale
+
+
+def _picked(
+    problem: Problem, inputs: Mapping[str, Any], profile: Mapping[str, Any], trace: Trace, tau_s: float
+) -> dict[str, Any]:
     """The design of a row of the tradeoff, as if it had been searched."""
+    picked = inputs["picked"]
     row, found = json.loads(str(picked["row"])), search_from(problem, picked)
     trace.add("picked", found)
     left_out = [{"what": "search for a design", "why": f"row {row['id']} of the tradeoff is picked"}]
-    return _artifacts(found, trace, {"tau_s": tau_s, "picked": row, "left_out": left_out})
+    report = {"tau_s": tau_s, "picked": row, "left_out": left_out}
+    return _artifacts(inputs["mesh"], profile, found, trace, report)
 
 
 def _refuse_weights(weights: Weights, goal: Goal) -> None:
@@ -113,16 +148,28 @@ def _refuse_weights(weights: Weights, goal: Goal) -> None:
 
 def _search(
     problem: Problem, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], trace: Trace, monitor: Monitor
-) -> tuple[Search, Search, int, float]:
-    """The best design of the attempts, the last relaxed one, how many were made, and the RMS error as printed, L0."""
+) -> _Searched:
+    """The best design of the attempts.
+
+    Where the elements of the last fit round the first relaxed design well, nothing is rounded in linear ones.
+    """
     first, start = _resumed(problem, trace, monitor)
     best, least = _restored_best(problem, monitor)
     before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
-    count = _points(problem, profile, trace, monitor)
+    count, finishes = _points(problem, profile, trace, monitor), dict[int, Search | None]()
+    enough = profile["goal"].smp == "enough"
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
         watch = _watch(attempt, start, trace, monitor, before_rounding)
-        found = solve_reduced(problem, settings, watch, start)
+        at = relaxed(problem, settings, watch, start)
+        if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
+            finishes[attempt] = finished = _finished(mesh, profile, at, settings, trace)
+            if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
+                return _Searched(at, settings, 1, np.inf, finished, [NOT_LINEAR])
+        found = solve_reduced(problem, settings, watch, at)
+        if best is None and _hopeless(profile, settings, found):
+            best = found
+            break
         start, weights = None, settings.weights
         rms = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, weights.error_scale).rms
         if best is None or rms < least:
@@ -131,7 +178,16 @@ def _search(
         if least <= settings.weights.error_scale or _hopeless(profile, settings, found):
             break
     assert best is not None  # at least one attempt is made
-    return best, before_rounding[-1], attempt + 1, least
+    last = before_rounding[-1]
+    if enough and attempt not in finishes:
+        finishes[attempt] = _finished(mesh, profile, last, settings, trace)
+    quadratic = element_for(mesh, profile["solver"].element)[0] == "quadratic"
+    left_out = [NOT_QUADRATIC] if quadratic and _far_off(last, settings) else []
+    return _Searched(best, settings, attempt + 1, least, finishes.get(attempt), left_out)
+
+
+def _rms(found: Search) -> float:
+    return shape_error(found.equilibria.problem, found.design.final.y).rms
 
 
 def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor, before_rounding: list[Search]) -> Watch:
@@ -223,10 +279,13 @@ def search_settings(
     return replace(settings, round_growth=FAST_GROWTH) if problem.n_tets > MANY_TETS else settings
 
 
-def _artifacts(found: Search, trace: Trace, report: dict[str, Any]) -> dict[str, Any]:
+def _artifacts(
+    mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], found: Search, trace: Trace, report: dict[str, Any]
+) -> dict[str, Any]:
     problem, design = found.equilibria.problem, found.design
     relaxed = {
         "rho": design.rho,
+        "repair_cost": repair_cost(mesh, profile["printer"], profile["goal"], found),
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),

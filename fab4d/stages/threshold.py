@@ -22,26 +22,27 @@ from fab4d.stages.monitor import Monitor
 # The smallest feature that holds its shape: lines across, layers high. Source: fabrication trials with three slicers.
 LINES_PER_FEATURE = 2
 LAYERS_PER_FEATURE = 2
-# A tet that the design is undecided about costs this share of its volume to change; a decided one 0.5 more.
+# A tet that the design is undecided about costs this share of the usual to change; a decided one 0.5 more.
 _LEAST_COST = 0.05
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Round the density, remove what cannot be printed, and judge the design by the two acceptance checks."""
     X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
-    rho = inputs["relaxed"]["rho"]
+    rho, cost = inputs["relaxed"]["rho"], inputs["relaxed"]["repair_cost"]
     monitor.progress("clean-up", tets=len(tets))
-    labels = labels_for(X, tets, rho, profile["printer"])
+    labels = labels_for(X, tets, rho, cost, profile["printer"])
     report = _report(X, tets, rho, labels, profile["acceptance"])
     return {"rounded": {"smp": labels.smp, "cluster": labels.cluster}, "threshold_report": report}
 
 
-def labels_for(X: FloatArray, tets: IntArray, rho: FloatArray, printer: PrinterCard) -> LabelResult:
-    """`printable_labels` of the density rho (m,) for a printer; tets that the design is sure about change last."""
+def labels_for(X: FloatArray, tets: IntArray, rho: FloatArray, cost: FloatArray, printer: PrinterCard) -> LabelResult:
+    """`printable_labels` of the density rho (m,) for a printer.
+
+    cost : (m,) of changing each tet; what the design is sure about costs more
+    """
     sure = np.abs(rho - 0.5) + _LEAST_COST
-    return printable_labels(
-        standing(X, printer.up), tets, rho, lines_of(printer), flip_cost=sure * np.abs(tet_volumes(X, tets))
-    )
+    return printable_labels(standing(X, printer.up), tets, rho, lines_of(printer), flip_cost=sure * cost)
 
 
 def lines_of(printer: PrinterCard) -> Lines:

@@ -9,9 +9,18 @@ from bars import TIGHT, bar, held_design, two_patches
 
 from fab4d.design import flips
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.flips import ErrorModes, FlipSettings, at_interface, choose_flips, error_modes, polish_labels
-from fab4d.design.gauss_newton import Design, build_model, equilibrate, held_positions
-from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
+from fab4d.design.flips import (
+    ErrorModes,
+    FlipSettings,
+    at_interface,
+    choose_flips,
+    error_modes,
+    influence,
+    polish_labels,
+    predicted_error,
+)
+from fab4d.design.gauss_newton import Design, equilibrate, held_positions
+from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
@@ -21,8 +30,7 @@ FREELY = FlipSettings(printable=lambda smp: smp, flippable=lambda smp, tet: True
 
 
 def modes_at(equilibria: Equilibria, design: Design) -> ErrorModes:
-    L = smoothness_matrix(equilibria.problem)
-    return error_modes(equilibria.problem, build_model(equilibria, WEIGHTS, L, design), design)
+    return error_modes(equilibria, design)
 
 
 def amplitudes(problem: Problem, modes: ErrorModes, design: Design, reference: Design) -> np.ndarray:
@@ -144,3 +152,30 @@ def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
     assert not smp[chosen].all()
     full = FlipSettings(FREELY.printable, FREELY.flippable, target_rms=0.0, max_smp_fraction=0.0)
     assert smp[choose_flips(problem, modes, design.rho, factors, full, 30)].all()
+
+
+def test_influence_tells_how_far_a_small_change_of_each_tet_moves_the_shape() -> None:
+    """With the held positions following, of what the modes see of it: the best move of these leaves that much."""
+    problem = bar(cells=(3, 1, 1), degrees=25.0)
+    equilibria = two_patches(problem)
+    labels = upper_half(problem)
+    modes = modes_at(equilibria, held_design(equilibria, labels.astype(np.float64), problem.X_temp))
+    found = influence(modes, labels.astype(np.float64))
+    assert found.mean() == pytest.approx(1.0)
+    step = modes.by_density * np.where(labels, -flips.FIRST_FACTORS[1], flips.FIRST_FACTORS[0])[:, None]
+    followed, *_ = np.linalg.lstsq(modes.by_held.T, step.T, rcond=None)
+    left = np.linalg.norm(step - followed.T @ modes.by_held, axis=1)
+    np.testing.assert_allclose(found, left / left.mean(), rtol=0.2, atol=0.05)
+    assert found.max() > 2 * found.min()
+
+
+def test_the_predicted_error_falls_with_the_flips_that_are_chosen_and_is_the_rest_without() -> None:
+    problem = bar(cells=(6, 3, 2), degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    rho = smp.astype(np.float64)
+    modes = modes_at(equilibria, held_design(equilibria, rho, problem.X_temp))
+    flipped = smp.copy()
+    flipped[choose_flips(problem, modes, rho, np.array(flips.FIRST_FACTORS), FREELY, 5)] ^= True
+    before, after = predicted_error(modes, rho, smp), predicted_error(modes, rho, flipped)
+    assert after < before
+    assert before <= np.linalg.norm(modes.amplitudes) * (1 + 1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bars import CARD, CLAMPED, bar, held_design, two_patches
 
-from fab4d.design import gauss_newton
+from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, held_positions
@@ -169,6 +169,24 @@ def test_going_on_from_any_state_ends_with_the_same_bits(truth: Truth, searched:
         again = solve_reduced(problem, settings_for(problem), lambda state: None, at)  # noqa: ARG005
         np.testing.assert_array_equal(again.design.rho, searched[-1].design.rho)
         np.testing.assert_array_equal(again.design.final.y, searched[-1].design.final.y)
+
+
+def test_rounding_ends_where_no_step_is_taken(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One step that is refused is followed by others; three in a row end it, with the best state so far."""
+    before = next(at for at in searched if at.phase is Phase.ROUND and at.iteration == 2)
+    refused: list[int] = []
+
+    def refuse(_: object, __: object, ___: object, design: Design, damping: float, *____: object) -> gauss_newton.Step:
+        refused.append(1)
+        return gauss_newton.Step(design, np.inf, damping, False)
+
+    monkeypatch.setattr(reduced, "gauss_newton_step", refuse)
+    found = solve_reduced(truth.problem, settings_for(truth.problem), lambda at: None, before)  # noqa: ARG005
+    assert len(refused) == 3
+    assert found.phase is Phase.DONE
+    assert found.design is before.design
 
 
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:

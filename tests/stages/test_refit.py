@@ -85,7 +85,7 @@ def test_loading_ends_in_the_fitted_state(inputs: Artifacts, fitted: tuple[str, 
 
 def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
     mesh, smp = inputs["mesh"], fitted[1]["labels"]["smp"]
-    again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), PROFILE["printer"])
+    again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), np.ones(len(smp)), PROFILE["printer"])
     np.testing.assert_array_equal(again.smp, smp)
 
 

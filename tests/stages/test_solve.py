@@ -17,6 +17,8 @@ from fab4d.stages._figures import limits_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run, search_settings
 
+QUADRATIC = SolverSettings(element="quadratic")
+
 
 @pytest.fixture(scope="module")
 def bar() -> dict[str, np.ndarray]:
@@ -78,7 +80,6 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where quadratic tets need more SMP than the goal allows, the labels of the linear ones are handed on."""
-    quadratic = SolverSettings(element="quadratic")
 
     def all_smp(problem: Problem, relaxed: Search, *_: Any) -> Search:
         rest = at_rest(problem)
@@ -86,5 +87,38 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
 
     monkeypatch.setattr(solve, "rounded_in", all_smp)
     for most, kept in ((None, True), (0.9, False)):
-        found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=quadratic)["relaxed"]
+        found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=QUADRATIC)["relaxed"]
         assert (len(found["x"]) > len(bar["X"])) == kept
+
+
+def phases(found: dict[str, Any]) -> list[bytes]:
+    return [line.split(b",")[1] for line in found["solve_trace"].splitlines()[1:]]
+
+
+def test_nothing_is_rounded_in_linear_elements_where_quadratic_ones_do_it_well() -> None:
+    bar = bent_bar((9, 2, 2), 50.0)
+    found = solved(bar, Goal(tolerance=1.0, max_forces=3), solver=QUADRATIC)
+    assert solve.NOT_LINEAR in found["solve_report"]["left_out"]
+    assert b"round" not in phases(found)[: phases(found).index(b"carried over")]
+    assert phases(found).count(b"carried over") == 1
+    assert len(found["relaxed"]["x"]) > len(bar["X"])
+
+
+def test_linear_elements_round_what_quadratic_ones_lose(
+    bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+    monkeypatch.setattr(solve, "rounded_in", lambda *_: tried.append(1))
+    found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
+    assert len(tried) == 1
+    assert len(found["relaxed"]["x"]) == len(bar["X"])
+    assert solve.NOT_LINEAR not in found["solve_report"]["left_out"]
+    assert found["solve_report"]["printed_rms_mm"] <= 1.5
+
+
+def test_a_goal_far_out_of_reach_is_not_rounded_in_quadratic_elements(bar: dict[str, np.ndarray]) -> None:
+    found = solved(bar, Goal(tolerance=0.01, max_forces=1), solver=QUADRATIC)
+    assert solve.NOT_QUADRATIC in found["solve_report"]["left_out"]
+    assert b"carried over" not in phases(found)
+    linear = solved(bar, Goal(tolerance=0.01, max_forces=1))
+    assert solve.NOT_QUADRATIC not in linear["solve_report"]["left_out"]

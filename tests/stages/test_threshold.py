@@ -16,7 +16,8 @@ PRINTER = load_printer("generic-dual-0.4", Path())
 
 def run(mesh, rho, printer=PRINTER, acceptance=None):
     profile = {"printer": printer, "acceptance": acceptance or Acceptance()}
-    out = threshold.run({"mesh": mesh, "relaxed": {"rho": rho}}, profile, SilentMonitor())
+    relaxed = {"rho": rho, "repair_cost": np.ones(len(rho))}
+    out = threshold.run({"mesh": mesh, "relaxed": relaxed}, profile, SilentMonitor())
     assert set(out) == {"rounded", "threshold_report"}
     return out["rounded"], out["threshold_report"]
 

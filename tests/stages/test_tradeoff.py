@@ -103,7 +103,8 @@ def test_stage_solve_takes_a_picked_row_as_it_is(scene: Scene, checked: dict[str
     assert made["solve_report"]["picked"] == json.loads(str(arrays["row"]))
     assert len(made["relaxed"]["patch_center"]) == 3
     assert [line.split(b",")[1] for line in made["solve_trace"].splitlines()[1:]] == [b"picked"]
-    labels = threshold.labels_for(checked["mesh"]["X"], checked["mesh"]["tets"], arrays["rho"], scene.printer)
+    cost = made["relaxed"]["repair_cost"]
+    labels = threshold.labels_for(checked["mesh"]["X"], checked["mesh"]["tets"], arrays["rho"], cost, scene.printer)
     assert labels.smp.any()
 
 
