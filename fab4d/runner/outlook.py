@@ -23,20 +23,20 @@ from fab4d.runner.workspace import Workspace
 # Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
 # A power below zero, noise of the runs, is taken as zero.
 STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (1.34, 0.15),
-    "solve": (18.1, 0.67),
-    "threshold": (0.11, 0.74),
-    "refit": (12.1, 0.15),
-    "verify": (5.63, 0.43),
-    "sensitivity": (4.45, 0.53),
-    "judge": (0.0236, 0.27),
-    "bodies": (0.978, 0.12),
-    "slice": (1.8, 0.54),
-    "rig": (0.502, 0.10),
-    "report": (0.512, 0.10),
+    "check": (1.27, 0.07),
+    "solve": (15.2, 0.70),
+    "threshold": (0.081, 0.72),
+    "refit": (9.46, 0.23),
+    "verify": (4.74, 0.55),
+    "sensitivity": (3.55, 0.57),
+    "judge": (0.0206, 0.32),
+    "bodies": (0.803, 0.16),
+    "slice": (2.46, 0.42),
+    "rig": (0.454, 0.13),
+    "report": (0.466, 0.13),
 }
 # Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (607, 13.5)
+MEMORY_MB = (598, 14.4)
 
 
 def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[str, Any]) -> list[str]:
