@@ -182,23 +182,11 @@ def choose_flips(
     return np.array(chosen, np.int64)
 
 
-def influence(modes: ErrorModes, rho: FloatArray) -> FloatArray:
-    """(m,) how far another material in each tet alone moves the final shape, held positions following; 1 on average.
+def whole_flips(modes: ErrorModes, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What another material in each tet alone does to the error, held positions following.
 
-    rho : (m,) near 0/1
+    rho : (m,) near 0/1. Returns the change (m, q) of the error's amplitudes by each flip, and the amplitudes (q,).
     """
-    change, _ = _whole_flips(modes, rho)
-    moved = np.linalg.norm(change, axis=1)
-    return moved / moved.mean() if moved.any() else np.ones(len(rho))
-
-
-def predicted_error(modes: ErrorModes, rho: FloatArray, labels: BoolArray) -> float:
-    """The error, as far as the modes see it, with `labels` (m,) instead of the near 0/1 density rho (m,)."""
-    change, residual = _whole_flips(modes, rho)
-    return float(np.linalg.norm(residual + change[labels != (rho > 0.5)].sum(axis=0)))
-
-
-def _whole_flips(modes: ErrorModes, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
     to_smp, to_tpe = FIRST_FACTORS
     return _predicted(modes, np.arange(len(rho)), np.where(rho > 0.5, -to_tpe, to_smp))
 

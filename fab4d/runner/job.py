@@ -23,6 +23,21 @@ class UndeclaredError(LookupError):
     """A stage and its row of the table disagree."""
 
 
+class Fields(dict[str, Any]):
+    """The arrays or values of a file that may be from another version or edited by hand.
+
+    Raises ArtifactError for one that it lacks.
+    """
+
+    def __init__(self, values: Mapping[str, Any], path: str, advice: str) -> None:
+        super().__init__(values)
+        self._path, self._advice = path, advice
+
+    def __missing__(self, name: str) -> Any:
+        msg = f'{self._path} has no "{name}": {self._advice}'
+        raise ArtifactError(msg)
+
+
 class Declared(Mapping[str, Any]):
     """What the table declares for a stage, and nothing else, so that the table cannot lie."""
 
@@ -111,7 +126,14 @@ class Job:
             return self.read_source(self.sources[name])
         if name == RUN:
             return self._run_record(stage)
-        return self.workspace.load(name) if self.workspace.exists(name) else self._absent(name)
+        if not self.workspace.exists(name):
+            return self._absent(name)
+        value, writer = self.workspace.load(name), self.table.writer(name)
+        if not isinstance(value, dict) or writer is None:
+            return value
+        return Fields(
+            value, str(self.workspace.path(name)), f"stage {writer.name} writes it, so run from {writer.name} on"
+        )
 
     def _absent(self, name: str) -> None:
         """None for an artifact that its stage did not need to write, or that nobody picked."""

@@ -16,9 +16,9 @@ from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import ambiguous_fraction, isolated_fraction, rounded_labels
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.tetmesh import BoolArray
-from fab4d.stages._repair import repair_cost
+from fab4d.stages._repair import repaired
 from fab4d.stages.refit import flip_settings, limit_reasons
-from fab4d.stages.threshold import acceptance_reasons, labels_for
+from fab4d.stages.threshold import acceptance_reasons
 
 # Flips win back a part of what rounding costs: beyond this multiple of the tolerance they do not reach it.
 HOPELESS = 3.0
@@ -46,8 +46,7 @@ def as_printed(
 
     Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
     """
-    cost = repair_cost(mesh, printer, goal, found)
-    smp = labels_for(mesh["X"], mesh["tets"], found.design.rho, cost, printer).smp
+    _, smp = repaired(mesh, printer, goal, found)
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))
     except EquilibriumError:

@@ -18,7 +18,7 @@ from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
-from fab4d.stages._repair import repair_cost
+from fab4d.stages._repair import repaired
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
 
@@ -60,12 +60,13 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         return _artifacts(mesh, profile, rest, trace, {"tau_s": tau_s, "left_out": why})
     if inputs["picked"] is not None:
         return _picked(problem, inputs, profile, trace, tau_s)
-    searched = _search(problem, mesh, profile, trace, monitor)
+    element, _ = element_for(mesh, profile["solver"].element)
+    searched = _search(problem, mesh, profile, element, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
         least = least_smp(problem, mesh, sections, searched.settings, searched.found, trace, monitor)
-        finished = _finished(mesh, profile, least.relaxed, searched.settings, trace)
+        finished = _finished(mesh, profile, element, least.relaxed, searched.settings, trace)
         searched = replace(searched, found=least.found, printed_rms=least.printed_rms, finished=finished)
     rms = searched.printed_rms
     report = {
@@ -100,6 +101,7 @@ class _Searched:
 def _finished(
     mesh: Mapping[str, np.ndarray],
     profile: Mapping[str, Any],
+    element: str,
     relaxed: Search,
     settings: ReducedSettings,
     trace: Trace,
@@ -109,7 +111,6 @@ def _finished(
     None where these are linear, lose it on the way or need more SMP than the goal allows, and where it misses the
     tolerance by far.
     """
-    element, _ = element_for(mesh, profile["solver"].element)
     if element == "linear" or relaxed.phase is not Phase.ROUND or _far_off(relaxed, settings):
         return None
     problem = problem_of(mesh, profile["materials"], element)
@@ -147,7 +148,12 @@ def _refuse_weights(weights: Weights, goal: Goal) -> None:
 
 
 def _search(
-    problem: Problem, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], trace: Trace, monitor: Monitor
+    problem: Problem,
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    element: str,
+    trace: Trace,
+    monitor: Monitor,
 ) -> _Searched:
     """The best design of the attempts.
 
@@ -163,26 +169,25 @@ def _search(
         watch = _watch(attempt, start, trace, monitor, before_rounding)
         at = relaxed(problem, settings, watch, start)
         if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
-            finishes[attempt] = finished = _finished(mesh, profile, at, settings, trace)
+            finishes[attempt] = finished = _finished(mesh, profile, element, at, settings, trace)
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
                 return _Searched(at, settings, 1, np.inf, finished, [NOT_LINEAR])
         found = solve_reduced(problem, settings, watch, at)
-        if best is None and _hopeless(profile, settings, found):
-            best = found
+        if _hopeless(profile, settings, found):
+            best = best or found
             break
         start, weights = None, settings.weights
         rms = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, weights.error_scale).rms
         if best is None or rms < least:
             best, least = found, rms
             monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
-        if least <= settings.weights.error_scale or _hopeless(profile, settings, found):
+        if least <= settings.weights.error_scale:
             break
     assert best is not None  # at least one attempt is made
     last = before_rounding[-1]
     if enough and attempt not in finishes:
-        finishes[attempt] = _finished(mesh, profile, last, settings, trace)
-    quadratic = element_for(mesh, profile["solver"].element)[0] == "quadratic"
-    left_out = [NOT_QUADRATIC] if quadratic and _far_off(last, settings) else []
+        finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
+    left_out = [NOT_QUADRATIC] if element == "quadratic" and _far_off(last, settings) else []
     return _Searched(best, settings, attempt + 1, least, finishes.get(attempt), left_out)
 
 
@@ -285,7 +290,7 @@ def _artifacts(
     problem, design = found.equilibria.problem, found.design
     relaxed = {
         "rho": design.rho,
-        "repair_cost": repair_cost(mesh, profile["printer"], profile["goal"], found),
+        "repair_cost": repaired(mesh, profile["printer"], profile["goal"], found)[0],
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),

@@ -115,6 +115,13 @@ def test_a_damaged_artifact_is_named(toy: ModuleType, tmp_path: Path) -> None:
         run(toy.job(tmp_path), first="add")
 
 
+def test_an_artifact_that_lacks_an_array_is_named_with_the_stage_to_run(toy: ModuleType, tmp_path: Path) -> None:
+    run(toy.job(tmp_path))
+    np.savez(tmp_path / "run/work/scaled.npz", other=np.zeros(2))
+    with pytest.raises(ArtifactError, match=r'scaled\.npz has no "values": .* run from scale on'):
+        run(toy.job(tmp_path), first="add")
+
+
 def test_an_artifact_that_is_no_longer_needed_is_removed(toy: ModuleType, tmp_path: Path) -> None:
     run(toy.job(tmp_path))
     assert run(toy.job(tmp_path, toy.ToyScene(with_extra=False))) == ["add", "tell"]
