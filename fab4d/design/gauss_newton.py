@@ -55,6 +55,8 @@ def equilibrate(
 
 
 TRIAL_ITERATIONS = 8
+# The way past unstable states is longer.
+ASTRAY_ITERATIONS = 20
 # A step that is predicted to move a node farther than this, in L0, is not tried.
 LARGEST_MOVE = 0.1
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
@@ -225,11 +227,13 @@ def gauss_newton_step(
     movable: BoolArray | None = None,
     tries: int = 6,
     least_promise: float = 0.0,
+    stay: bool = True,
 ) -> Step:
     """One Levenberg-Marquardt step on density and held positions; the damping rises until the objective falls.
 
     movable : (m,) tets whose density may change; None for all
     least_promise : share of the objective by which the model has to see it fall for a step to be worth its equilibria
+    stay : give up a step whose way leads past unstable states; else the equilibria found beyond count too
     """
     value = evaluate(equilibria, weights, L, design)
     model = build_model(equilibria, weights, L, design)
@@ -239,7 +243,7 @@ def gauss_newton_step(
         dc = damped.held_step(drho)
         # The model falls by this at most: its quadratic part takes some of it back.
         promised = -float(model.gradient_rho @ drho + model.gradient_c @ dc.ravel())
-        trial = _trial(equilibria, model, design, drho, dc) if promised > least_promise * value else None
+        trial = _trial(equilibria, model, design, drho, dc, stay) if promised > least_promise * value else None
         if trial is not None:
             new = evaluate(equilibria, weights, L, trial)
             if new < value:
@@ -276,7 +280,9 @@ def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | Non
     return drho
 
 
-def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArray, dc: FloatArray) -> Design | None:
+def _trial(
+    equilibria: Equilibria, model: Model, design: Design, drho: FloatArray, dc: FloatArray, stay: bool
+) -> Design | None:
     """The equilibria after a step, from its linear prediction; None where that goes too far to be of use."""
     dx, df, dy = model.lin.forward(drho, dc)
     if max(np.abs(dx).max(), np.abs(dy).max()) > LARGEST_MOVE:
@@ -284,7 +290,8 @@ def _trial(equilibria: Equilibria, model: Model, design: Design, drho: FloatArra
     median, y = design.median, design.final.y
     rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
     x0, y0 = equilibria.held_turning.step(median.x, dx), equilibria.free_turning.step(y, dy)
-    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=TRIAL_ITERATIONS, stay=True)
+    most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
+    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=most, stay=stay)
 
 
 def held_positions(equilibria: Equilibria, median: Median) -> FloatArray:

@@ -14,6 +14,7 @@ from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_mat
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
+from fab4d.mesh.measures import face_area_vectors
 from fab4d.mesh.tetmesh import FloatArray
 
 START_DENSITY = 0.6
@@ -24,6 +25,11 @@ FIRST_LAM_ROUND = 0.02
 # of the tolerance.
 EXCHANGE_AFTER, EXCHANGED, GOOD_ENOUGH = 3, 4, 0.25
 STEPS_AFTER_EXCHANGE = 2
+# Where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states.
+NEARLY = 1.5
+# Larger pads are taken where the pull on a small one is more than this share of the TPE's shear modulus: it dents the
+# surface and creases it at the rim.
+LARGEST_TRACTION = 0.25
 # While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
 ROUNDING_LOSS = 2.5
 # While there is too much SMP, its price grows by this power of the growth of lam_round.
@@ -71,6 +77,7 @@ class Search:
     iteration, slow : steps of this phase, and how many of the last gained little, or while rounding nothing
     exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
+    stay : whether steps whose way leads past unstable states are given up
     """
 
     equilibria: Equilibria
@@ -85,6 +92,7 @@ class Search:
     exchanges: int = 0
     accepted: bool = True
     relaxed_rms: float = np.inf
+    stay: bool = True
 
 
 Watch = Callable[[Search], None]
@@ -148,24 +156,38 @@ def fewest_points(problem: Problem, settings: ReducedSettings, enough: float, wa
 def first_search(problem: Problem, settings: ReducedSettings) -> Search:
     """The points held where the wanted shape has them, everything else relaxed from X_temp.
 
-    With the smallest patches whose pull stretches no material too far, or else the largest. Raises EquilibriumError
-    when no equilibrium near X_temp is found with so few patches.
+    With the smallest patches whose pull stretches no material too far and whose traction is below LARGEST_TRACTION, or
+    else the largest. Raises EquilibriumError when no equilibrium near X_temp is found with so few patches.
     """
     if not problem.clamp.any() and settings.n_points < FEWEST_FREE_POINTS:
         msg = f"a part without a clamp needs {FEWEST_FREE_POINTS} points at least: give one or raise [goal] max_forces"
         raise EquilibriumError(msg)
     rho = np.full(problem.n_tets, START_DENSITY)
     x = np.where(problem.clamp[:, None], problem.body.X, problem.X_temp)
+    needed = 0.0
     for radius in settings.patch_radii:
+        if radius < needed and radius != settings.patch_radii[-1]:
+            continue
         equilibria, median = _held_at_target(problem, settings.n_points, radius, rho, x)
-        x = median.x
-        if not len(stretch_excess(problem, settings.weights, rho, x).tets):
+        x, traction = median.x, largest_traction(equilibria.patches, problem, median)
+        if traction <= LARGEST_TRACTION and not len(stretch_excess(problem, settings.weights, rho, x).tets):
             break
+        # The forces grow with the pads, so that none smaller than this will do.
+        needed = radius * np.sqrt(traction / LARGEST_TRACTION)
     final = equilibria.solve_final(rho, median, median.x, max_iterations=100)
     if not final.solution.converged:
         msg = f"the first design finds no final shape ({final.solution.status.value}): check the temporary shape"
         raise EquilibriumError(msg)
     return Search(equilibria, Design(rho, median, final), radius, lam_SMP=settings.weights.lam_SMP)
+
+
+def largest_traction(patches: Patches, problem: Problem, median: Median) -> float:
+    """The largest mean traction of a patch, in mu_TPE."""
+    if not patches.count:
+        return 0.0
+    areas = np.linalg.norm(face_area_vectors(problem.body.X, patches.faces), axis=1)
+    pulls = np.linalg.norm(median.forces, axis=1)
+    return float((pulls / np.add.reduceat(areas, patches.offsets[:-1])).max())
 
 
 def _held_at_target(
@@ -214,16 +236,21 @@ def spread_patches(problem: Problem, count: int, radius: float) -> Patches:
 
 
 def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
-    """Gauss-Newton on the relaxed density until the objective falls by less than 2 % in two steps running."""
+    """Gauss-Newton on the relaxed density until the objective falls by less than 2 % in two steps running.
+
+    Where that nearly meets the tolerance, once more with steps past unstable states.
+    """
     weights = settings.weights.replace(lam_SMP=at.lam_SMP)
     value = evaluate(at.equilibria, weights, L, at.design)
-    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
+    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping, stay=at.stay)
     slow = at.slow + 1 if step.value > 0.98 * value else 0
     after = replace(at, design=step.design, damping=step.damping, accepted=step.accepted, slow=slow)
     if at.exchanges < EXCHANGED and (not step.accepted or slow == 2 or at.iteration + 1 == EXCHANGE_AFTER):
         return replace(after, phase=Phase.EXCHANGE, iteration=at.iteration + 1)
     if not step.accepted or slow == 2 or at.iteration + 1 >= settings.relax_iterations:
         rms = shape_error(at.equilibria.problem, step.design.final.y).rms
+        if at.stay and weights.error_scale < rms <= NEARLY * weights.error_scale:
+            return replace(after, stay=False, damping=FIRST_DAMPING, iteration=0, slow=0, exchanges=EXCHANGED - 1)
         rounding = replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, relaxed_rms=rms)
         return replace(rounding, iteration=0, slow=0)
     return replace(after, iteration=at.iteration + 1)
@@ -239,7 +266,7 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
     for equilibria, moved in exchanged(at.equilibria, weights, model, at.design, at.patch_radius):
         design, damping = moved, FIRST_DAMPING
         for _ in range(STEPS_AFTER_EXCHANGE):
-            step = gauss_newton_step(equilibria, weights, L, design, damping)
+            step = gauss_newton_step(equilibria, weights, L, design, damping, stay=at.stay)
             design, damping = step.design, step.damping
         if evaluate(equilibria, weights, L, design) < value:
             after = replace(at, equilibria=equilibria, design=design, phase=Phase.RELAX, damping=damping)
@@ -254,7 +281,7 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
     scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
     weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)
-    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping)
+    step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping, stay=at.stay)
     slow = 0 if step.accepted else at.slow + 1
     finished = (
         undecided_fraction(step.design.rho) <= settings.undecided_fraction

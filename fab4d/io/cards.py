@@ -54,7 +54,7 @@ class RigCard:
     pull_only: bool
     source: str
     larger_patch_radii: tuple[float, ...] = ()
-    """Of the other pads it has, for parts that the usual ones stretch too far."""
+    """Of the other pads it has, for parts that the usual ones stretch too far or pull too hard on too small an area."""
     max_travel: float | None = None
     """How far it moves a point, mm; None where the card does not tell."""
 

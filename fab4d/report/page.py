@@ -220,11 +220,29 @@ def _triple(vector: Sequence[float], decimals: int) -> str:
 def _stages(report: Mapping[str, Any]) -> str:
     rows = "".join(
         f'<tr><td>{escape(s["name"])}</td><td class="number">{s["wall_s"]:.2f}</td>'
-        f'<td class="number">{"–" if s["tau"] is None else format(s["tau"], ".0f")}</td></tr>'
+        f'<td class="number">{_whole(s["tau"])}</td><td class="number">{_whole(s["peak_rss_mb"])}</td></tr>'
         for s in report["stages"]
     )
-    head = '<tr><th>stage</th><th class="number">s</th><th class="number">factorisations (tau)</th></tr>'
-    return f"<table>{head}{rows}</table>"
+    head = (
+        '<tr><th>stage</th><th class="number">s</th><th class="number">factorisations (tau)</th>'
+        '<th class="number">memory so far, MB</th></tr>'
+    )
+    return f"<table>{head}{rows}</table>{_growth(report['growth'])}"
+
+
+def _growth(growth: Mapping[str, Any]) -> str:
+    """What finer meshes would take, by the laws fitted to the samples."""
+    expected = "; ".join(
+        f"{finer['tets']:,} tets {plain(finer['wall_s'])} s and {_whole(finer['peak_rss_mb'])} MB"
+        for finer in growth["finer"]
+    )
+    power = growth["powers"].get("solve")
+    grows = "" if power is None else f", the search as their number to the power {power:g}"
+    return f"<p>This mesh has {growth['tets']:,} tets. By the growth measured on the samples{grows}: {expected}.</p>"
+
+
+def _whole(value: float | None) -> str:
+    return "–" if value is None else format(value, ".0f")
 
 
 def _origin(report: Mapping[str, Any]) -> str:

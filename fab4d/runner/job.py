@@ -152,7 +152,10 @@ class Job:
         finished = [(name, manifest) for name, manifest in manifests if manifest]
         peaks = [manifest["peak_rss_mb"] for _, manifest in finished if manifest["peak_rss_mb"] is not None]
         return {
-            "stages": [{"name": name, "wall_s": manifest["wall_s"]} for name, manifest in finished],
+            "stages": [
+                {"name": name, "wall_s": manifest["wall_s"], "peak_rss_mb": manifest["peak_rss_mb"]}
+                for name, manifest in finished
+            ],
             "wall_s": sum(manifest["wall_s"] for _, manifest in finished),
             "peak_rss_mb": max(peaks, default=None),
             "versions": versions(),

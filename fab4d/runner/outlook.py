@@ -1,6 +1,7 @@
 """What is ahead of a scene: stages, what is left out, and roughly how long it takes.
 
-`python -m fab4d.runner.outlook RUN...` prints what finished runs took and the laws fitted to them: the constants below.
+`python -m fab4d.runner.outlook RUN...` prints what finished runs took and the laws fitted to them: the constants of
+`report.growth`.
 """
 
 import sys
@@ -11,32 +12,13 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.tradeoff import MOST_TRIALS
+from fab4d.report.growth import peak_mb, stage_seconds
 from fab4d.runner.display import duration
 from fab4d.runner.job import Job
 from fab4d.runner.runner import Selection, Step, plan
 from fab4d.runner.summary import finding_lines
 from fab4d.runner.table import stage_table
 from fab4d.runner.workspace import Workspace
-
-# Fitted to the seven samples (240 to 14,400 tets) on two cores busy with other work. Those of up to 4,860 tets are
-# finished in quadratic tets, the others in linear ones, so that the laws are rough.
-# Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
-# A power below zero, noise of the runs, is taken as zero.
-STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (1.27, 0.07),
-    "solve": (15.2, 0.70),
-    "threshold": (0.081, 0.72),
-    "refit": (9.46, 0.23),
-    "verify": (4.74, 0.55),
-    "sensitivity": (3.55, 0.57),
-    "judge": (0.0206, 0.32),
-    "bodies": (0.803, 0.16),
-    "slice": (2.46, 0.42),
-    "rig": (0.454, 0.13),
-    "report": (0.466, 0.13),
-}
-# Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (598, 14.4)
 
 
 def plan_lines(job: Job, mesh: Mapping[str, np.ndarray], check_report: Mapping[str, Any]) -> list[str]:
@@ -71,18 +53,6 @@ def _expectation(steps: Sequence[Step], n_tets: int, *, least_smp: bool) -> str:
     return f"expected, roughly, on two cores: {duration(seconds)}, {peak_mb(n_tets):.0f} MB of memory"
 
 
-def stage_seconds(stage: str, n_tets: int) -> float:
-    """Seconds that a stage takes: s * (n_tets / 1000) ** p."""
-    seconds, power = STAGE_SECONDS[stage]
-    return seconds * (n_tets / 1000) ** power
-
-
-def peak_mb(n_tets: int) -> float:
-    """Peak memory of a run, MB: base + slope * n_tets / 1000."""
-    base, slope = MEMORY_MB
-    return base + slope * n_tets / 1000
-
-
 def measured(root: Path) -> dict[str, Any]:
     """Tets, seconds of each stage and peak memory of the finished run in the folder `root`."""
     workspace = Workspace(root, stage_table().artifacts)
@@ -108,7 +78,7 @@ def straight_line(sizes: Sequence[float], values: Sequence[float]) -> tuple[floa
 
 
 def fit_lines(runs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """A table of the runs and the constants of this module fitted to them."""
+    """A table of the runs and the constants of `report.growth` fitted to them."""
     runs = sorted(runs, key=lambda run: run["n_tets"])
     sizes = [run["n_tets"] for run in runs]
     names = stage_table().names
@@ -116,10 +86,16 @@ def fit_lines(runs: Iterable[Mapping[str, Any]]) -> list[str]:
     for run in runs:
         seconds = "".join(f"{run['seconds'].get(name, float('nan')):11.2f}" for name in names)
         lines.append(f"{run['n_tets']:<8}{seconds}{run['peak_mb']:11.0f}")
-    laws = {name: power_law(sizes, [run["seconds"][name] for run in runs]) for name in names}
+    laws = {name: _law_of(name, runs) for name in names}
     lines += [f'    "{name}": ({seconds:.3g}, {power:.2f}),' for name, (seconds, power) in laws.items()]
     base, slope = straight_line(sizes, [run["peak_mb"] for run in runs])
     return [*lines, f"MEMORY_MB = ({base:.0f}, {slope:.3g})"]
+
+
+def _law_of(stage: str, runs: Iterable[Mapping[str, Any]]) -> tuple[float, float]:
+    """Of the runs in which the stage ran: a run of an earlier version may lack it."""
+    timed = [(run["n_tets"], run["seconds"][stage]) for run in runs if stage in run["seconds"]]
+    return power_law(*zip(*timed, strict=True))
 
 
 if __name__ == "__main__":

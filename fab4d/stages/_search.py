@@ -11,7 +11,7 @@ from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
 
-_NUMBERS = ("patch_radius", "lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms")
+_NUMBERS = ("patch_radius", "lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms", "stay")
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:
@@ -34,7 +34,9 @@ def search_from(problem: Problem, saved: Mapping[str, np.ndarray]) -> Search:
     Raises ArtifactError when they are not.
     """
     numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
-    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")}
+    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")} | {
+        "stay": bool(numbers["stay"])
+    }
     equilibria = Equilibria(problem, build_patches(problem, saved["centers"], numbers["patch_radius"]))
     held = equilibria.patches.mean(saved["x"]) + RIG_COMPLIANCE * saved["forces"]
     design = equilibrate(equilibria, saved["rho"], held, saved["x"], saved["forces"], saved["y"])

@@ -7,6 +7,7 @@ import numpy as np
 
 from fab4d.io.meshes import vtu_bytes
 from fab4d.report import metrics
+from fab4d.report.growth import growth
 from fab4d.report.page import report_page, view_data
 from fab4d.report.trace import joined_trace, trace_csv, trace_plot
 from fab4d.report.verdict import (
@@ -93,9 +94,7 @@ def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, 
     solve, refit = inputs["solve_report"] or {}, inputs["refit_report"] or {}
     # Of the element that is delivered; without a fit, of the search.
     run, tau_s = inputs["run"], refit.get("tau_s", solve.get("tau_s"))
-    stages = [
-        {"name": s["name"], "wall_s": s["wall_s"], "tau": s["wall_s"] / tau_s if tau_s else None} for s in run["stages"]
-    ]
+    stages = [stage | {"tau": stage["wall_s"] / tau_s if tau_s else None} for stage in run["stages"]]
     return {
         "picked": solve.get("picked"),
         "tau_s": tau_s,
@@ -104,6 +103,7 @@ def _origin(inputs: Mapping[str, Any], reports: Mapping[str, Any]) -> dict[str, 
         "findings": _findings(inputs["check_report"]),
         "left_out": left_out_of(reports),
         "stages": stages,
+        "growth": growth(len(inputs["mesh"]["tets"]), stages, run["peak_rss_mb"]),
         "versions": run["versions"],
         "inputs": run["inputs"],
     }

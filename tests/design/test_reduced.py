@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from bars import CARD, CLAMPED, bar, held_design, two_patches
+from bars import CARD, CLAMPED, bar, corner, held_design, two_patches
 
 from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
-from fab4d.design.patches import outward_normals
+from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import (
     Phase,
@@ -21,8 +21,10 @@ from fab4d.design.reduced import (
     change_density,
     fewest_points,
     first_search,
+    largest_traction,
     polished,
     refit,
+    relax_step,
     relaxed,
     solve_reduced,
     undecided_fraction,
@@ -112,6 +114,95 @@ def test_larger_patches_are_taken_where_small_ones_stretch_too_far(truth: Truth)
         assert np.isclose(largest_stretch(problem, found.design.median.x), stretches[radii.index(expected)])
 
 
+def test_larger_patches_are_taken_where_small_ones_pull_too_hard(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit lies between the tractions of the smallest and the largest; what is surely too small is not tried."""
+    problem, radii = truth.problem, tuple(radius / truth.problem.length for radius in (3.0, 3.1, 9.0))
+    tried: list[int] = []
+
+    def kept(_: Problem, centers: np.ndarray, radius: float) -> Patches:
+        tried.append(radii.index(radius))
+        return build_patches(problem, centers, radius)
+
+    def with_limit(limit: float) -> Search:
+        tried.clear()
+        monkeypatch.setattr(reduced, "LARGEST_TRACTION", limit)
+        return first_search(problem, settings_for(problem, patch_radii=radii))
+
+    monkeypatch.setattr(reduced, "build_patches", kept)
+    tractions = {}
+    for radius in (radii[0], radii[2]):
+        found = first_search(problem, settings_for(problem, patch_radii=(radius,)))
+        tractions[radius] = largest_traction(found.equilibria.patches, problem, found.design.median)
+    small, large = tractions[radii[0]], tractions[radii[2]]
+    assert large < 0.9 * small
+    for limit, expected, seen in (
+        (1.01 * small, 0, [0]),
+        (0.5 * (small + large), 2, [0, 2]),
+        (0.01 * large, 2, [0, 2]),
+    ):
+        assert with_limit(limit).patch_radius == radii[expected]
+        assert tried == seen
+
+
+def test_the_traction_of_a_patch_is_its_force_over_its_area(truth: Truth) -> None:
+    """On the flat end of the bar that a large patch covers."""
+    problem = truth.problem
+    tip = int(np.argmax(problem.body.X[:, 0]))
+    patches = build_patches(problem, np.array([tip]), 1.0)
+    flat = problem.body.X[patches.faces][:, :, 0].min(axis=1) == problem.body.X[:, 0].max()
+    area = np.ptp(problem.body.X[:, 1]) * np.ptp(problem.body.X[:, 2])
+    end = patches_from_faces(problem, np.array([tip]), patches.faces[flat], np.array([0, flat.sum()]))
+    median = replace(truth.design.median, forces=np.array([[0.3, 0.0, -0.4]]))
+    assert largest_traction(end, problem, median) == pytest.approx(0.5 / area)
+    assert largest_traction(build_patches(problem, np.zeros(0, np.int64), 0.1), problem, median) == 0
+
+
+@pytest.mark.parametrize(("share", "goes_on"), [(0.9, False), (1.2, True), (3.0, False)])
+def test_steps_past_unstable_states_are_taken_where_the_tolerance_is_nearly_met(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch, share: float, goes_on: bool
+) -> None:
+    """Once, at the end of relaxing: then the same state is about to be rounded."""
+    problem, stays = truth.problem, list[bool]()
+    start = first_search(problem, settings_for(problem))
+    weights = WEIGHTS.replace(error_scale=rms(problem, start.design) / share)
+    settings, L = settings_for(problem, weights=weights), smoothness_matrix(problem)
+
+    def refuse(*_: object, stay: bool = True) -> gauss_newton.Step:
+        stays.append(stay)
+        return gauss_newton.Step(start.design, np.inf, 1.0, False)
+
+    monkeypatch.setattr(reduced, "gauss_newton_step", refuse)
+    after = relax_step(replace(start, exchanges=reduced.EXCHANGED), settings, L)
+    assert after.phase is (Phase.RELAX if goes_on else Phase.ROUND)
+    if goes_on:
+        last = relax_step(replace(after, exchanges=reduced.EXCHANGED), settings, L)
+        assert last.phase is Phase.ROUND
+        assert last.relaxed_rms == rms(problem, start.design)
+    assert stays == [True, False][: 1 + goes_on]
+
+
+@pytest.mark.parametrize("stay", [True, False])
+def test_a_step_may_lead_past_unstable_states(monkeypatch: pytest.MonkeyPatch, stay: bool) -> None:
+    """A strut, pushed along its axis by a fifth of its length in one step, buckles on its way to equilibrium."""
+    problem = bar(cells=(10, 2, 2), degrees=0.0)
+    X, rho = problem.body.X, np.full(problem.n_tets, 0.6)
+    equilibria = Equilibria(
+        problem, build_patches(problem, np.array([corner(problem, (1.0, 0.5, 0.5))]), 6 / problem.length)
+    )
+    straight = held_design(equilibria, rho, X)
+    L = smoothness_matrix(problem)
+    model = gauss_newton.build_model(equilibria, WEIGHTS, L, straight)
+    monkeypatch.setattr(gauss_newton, "LARGEST_MOVE", 1.0)
+    found = gauss_newton._trial(
+        equilibria, model, straight, np.zeros(problem.n_tets), np.array([[-0.2, 0.0, 0.0]]), stay
+    )
+    assert (found is None) == stay
+    if found is not None:
+        tangent = equilibria.held_analysis.factor(equilibria.median_tangent(rho, found.median.x))
+        assert tangent.n_negative == 3
+        assert np.abs(found.median.x - X)[:, 1:].max() > 0.1
+
+
 def largest_stretch(problem: Problem, x: np.ndarray) -> float:
     body = problem.body
     F = np.einsum("mai,maj->mij", x[body.elements], body.dN.mean(axis=1))
@@ -178,7 +269,7 @@ def test_rounding_ends_where_no_step_is_taken(
     before = next(at for at in searched if at.phase is Phase.ROUND and at.iteration == 2)
     refused: list[int] = []
 
-    def refuse(_: object, __: object, ___: object, design: Design, damping: float, *____: object) -> gauss_newton.Step:
+    def refuse(_: object, __: object, ___: object, design: Design, damping: float, **____: object) -> gauss_newton.Step:
         refused.append(1)
         return gauss_newton.Step(design, np.inf, damping, False)
 

@@ -119,10 +119,10 @@ def inputs(bar: ModuleType) -> dict[str, Any]:
         "rig_report": {"points": 3, "reasons": [], "left_out": []},
         "run": {
             "stages": [
-                {"name": "check", "wall_s": 0.5},
-                {"name": "solve", "wall_s": 4.0},
-                {"name": "threshold", "wall_s": 0.25},
-                {"name": "refit", "wall_s": 1.0},
+                {"name": "check", "wall_s": 0.5, "peak_rss_mb": 150.0},
+                {"name": "solve", "wall_s": 4.0, "peak_rss_mb": 210.0},
+                {"name": "threshold", "wall_s": 0.25, "peak_rss_mb": 210.0},
+                {"name": "refit", "wall_s": 1.0, "peak_rss_mb": 210.0},
             ],
             "wall_s": 5.75,
             "peak_rss_mb": 210.0,

@@ -22,7 +22,7 @@ FIELDS = [
     *("ambiguous_fraction", "isolated_fraction", "fixity", "undesired_deformation", "equilibrium_residual"),
     *("min_det_F", "element_order", "force_change", "force_uncertainty", "mass_g", "cost_usd", "sensitivity"),
     *("printing", "picked", "tau_s", "wall_s"),
-    *("peak_rss_mb", "findings", "left_out", "stages", "versions", "inputs"),
+    *("peak_rss_mb", "findings", "left_out", "stages", "growth", "versions", "inputs"),
 ]
 
 
@@ -78,7 +78,7 @@ def test_report_has_the_fields_of_the_contract_verdict_first(result):
     report = json.loads(json.dumps(result["report_json"], allow_nan=False))
     assert list(report) == FIELDS
     assert report["verdict"] == "ACCEPTED"
-    assert report["stages"][1] == {"name": "solve", "wall_s": 4.0, "tau": 400.0}
+    assert report["stages"][1] == {"name": "solve", "wall_s": 4.0, "peak_rss_mb": 210.0, "tau": 400.0}
     assert [item["what"] for item in report["left_out"]] == ["gravity", "iterative solver"]
 
 
