@@ -8,6 +8,7 @@ from scipy.sparse import csr_array, diags_array
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
+from fab4d.mesh.measures import unit_vectors
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 
@@ -122,12 +123,10 @@ class ForceExcess:
 
 def forces_beyond(weights: ObjectiveWeights, patches: Patches, median: Median) -> ForceExcess:
     """Forces of the median shape that are too large, or that push where the rig only pulls."""
-    excess, along = force_excess(median.forces, weights.max_force), unit_rows(median.forces) / weights.max_force
+    excess, along = force_excess(median.forces, weights.max_force), unit_vectors(median.forces) / weights.max_force
     if weights.pull_only and patches.count:
-        usual = float(np.sqrt((median.forces**2).sum(axis=1).mean())) + 1e-12
-        normals = outward_normals(patches, median.x)
-        pushed = np.maximum(PULL_MARGIN - (median.forces * normals).sum(axis=1) / usual, 0.0)
-        excess, along = np.concatenate([excess, pushed]), np.concatenate([along, -normals / usual])
+        push = pushes(patches, median)
+        excess, along = np.concatenate([excess, push.excess]), np.concatenate([along, -push.normals / push.usual])
     active, scale = np.flatnonzero(excess > 0), np.sqrt(2 * weights.limit)
     rows = np.zeros((len(active), patches.count, 3))
     if len(active):
@@ -135,10 +134,22 @@ def forces_beyond(weights: ObjectiveWeights, patches: Patches, median: Median) -
     return ForceExcess(scale * excess[active], rows.reshape(len(active), 3 * patches.count))
 
 
-def unit_rows(vectors: FloatArray) -> FloatArray:
-    """Vectors (k, 3) divided by their lengths; zero stays zero."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(lengths > 0, lengths, 1.0)
+@dataclass(frozen=True, eq=False)
+class Pushes:
+    """How far each force (K,) is from being a pull: what it lacks of PULL_MARGIN `usual` along its outward normal
+    (K, 3), relative to the usual force."""
+
+    excess: FloatArray
+    normals: FloatArray
+    usual: float
+
+
+def pushes(patches: Patches, median: Median) -> Pushes:
+    """Forces of the median shape that a rig which only pulls cannot give."""
+    usual = float(np.sqrt((median.forces**2).sum(axis=1).mean())) + 1e-12
+    normals = outward_normals(patches, median.x)
+    outward = (median.forces * normals).sum(axis=1) / usual
+    return Pushes(np.maximum(PULL_MARGIN - outward, 0.0), normals, usual)
 
 
 @dataclass(frozen=True, eq=False)

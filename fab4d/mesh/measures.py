@@ -20,6 +20,12 @@ def face_area_vectors(X: FloatArray, faces: IntArray) -> FloatArray:
     return 0.5 * np.cross(X[faces[:, 1]] - X[faces[:, 0]], X[faces[:, 2]] - X[faces[:, 0]])
 
 
+def unit_vectors(vectors: FloatArray) -> FloatArray:
+    """Vectors (k, 3) divided by their lengths; zero stays zero."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(lengths > 0.0, lengths, 1.0)
+
+
 def vertex_areas(X: FloatArray, faces: IntArray) -> FloatArray:
     """A third of the area of the triangles `faces` at each vertex, (n,), mm^2; zero off the surface."""
     areas = np.linalg.norm(face_area_vectors(X, faces), axis=1)

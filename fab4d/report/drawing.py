@@ -10,12 +10,12 @@ from reportlab.lib.utils import ImageReader
 from reportlab.pdfbase.pdfmetrics import stringWidth
 from reportlab.pdfgen.canvas import Canvas
 
+from fab4d.mesh.measures import unit_vectors
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.report.labels import place_labels
 from fab4d.report.views import CLAMP_COLOUR, Figure, Projection, hidden_points, picture
 from fab4d.report.wording import number, scale_words
 from fab4d.rig.plan import RigPlan
-from fab4d.rig.points import unit_vectors
 
 DPI = 200.0
 LABEL_RADIUS = 2.3

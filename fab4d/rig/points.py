@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fab4d.mesh.measures import face_area_vectors
+from fab4d.mesh.measures import face_area_vectors, unit_vectors
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.units import N_PER_KGF
 
@@ -89,9 +89,3 @@ def load_points(state: Mapping[str, np.ndarray]) -> LoadPoints:
         hold=state["patch_held"],
         normal=unit_vectors(np.reshape([face_area_vectors(x, pad).sum(axis=0) for pad in pads], (-1, 3))),
     )
-
-
-def unit_vectors(vectors: FloatArray) -> FloatArray:
-    """Vectors (k, 3) divided by their lengths; zero stays zero."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(lengths > 0.0, lengths, 1.0)

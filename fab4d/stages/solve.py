@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.finish import rounded_in
-from fab4d.design.objective import force_excess, shape_error, stretch_excess
+from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
 from fab4d.errors import SceneError
@@ -222,12 +222,14 @@ def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> 
     weights = search_settings(problem, profile).weights
     if found.relaxed_rms <= weights.error_scale:
         return None
-    median, limits = found.design.median, []
+    median, patches, limits = found.design.median, found.equilibria.patches, []
     if (force_excess(median.forces, weights.max_force) > 0).any():
         limits.append("the largest force of the rig")
     if len(stretch_excess(problem, weights, found.design.rho, median.x).tets):
         limits.append("the largest stretch of the materials")
-    what = " and ".join(limits) if limits else f"the number of points, {found.equilibria.patches.count}"
+    if weights.pull_only and patches.count and (pushes(patches, median).excess > 0).any():
+        limits.append("that the rig only pulls")
+    what = " and ".join(limits) if limits else f"the number of points, {patches.count}"
     error = shape_error(problem, found.design.final.y).e
     worst = problem.body.X[np.argmax(np.linalg.norm(error, axis=1))] * problem.length
     place = ", ".join(f"{x:.3g}" for x in worst)

@@ -55,6 +55,15 @@ def test_a_goal_out_of_reach_says_what_limits_it(bar: dict[str, np.ndarray]) -> 
     assert report["limited_by"].startswith("the largest force of the rig")
 
 
+def test_a_rig_that_only_pulls_is_named_where_that_limits(bar: dict[str, np.ndarray]) -> None:
+    """The bar is to become shorter: its end has to be pushed."""
+    shorter = bar | {"X_temp": bar["X"] * [0.8, 1.0, 1.0]}
+    goal = Goal(tolerance=0.02, max_forces=2)
+    pulling = replace(PROFILE["rig"], pull_only=True)
+    assert "that the rig only pulls" in solved(shorter, goal, rig=pulling)["solve_report"]["limited_by"]
+    assert "pulls" not in solved(shorter, goal)["solve_report"]["limited_by"]
+
+
 @pytest.mark.parametrize("share", [1.0, 0.1])
 def test_solver_and_verdict_mean_the_same_by_a_goal_without_a_tolerance(
     bar: dict[str, np.ndarray], share: float
