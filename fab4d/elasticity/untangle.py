@@ -1,5 +1,6 @@
 """Mending inverted tets of a wanted shape: an inversion-safe energy relaxes vertices until det F > 0 everywhere."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -39,10 +40,17 @@ class _Region(NamedTuple):
     """Stiffness (free,) of the springs that hold surface vertices to their places."""
 
 
-def untangle(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -> Untangled:
+Tell = Callable[[str], None]
+
+
+def silent(what: str) -> None:
+    """Tell nobody."""
+
+
+def untangle(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray, tell: Tell = silent) -> Untangled:
     """Move as few and as inner vertices of x (n, 3), mm, as it takes to have det dx/dX > 0 in all tets (m, 4).
 
-    fixed : (n,) vertices that stay where they are
+    fixed : (n,) vertices that stay where they are        tell : is told of each attempt
     Raises nothing: `min_det_F` of the result tells whether it succeeded.
     Source: Garanzha et al., Foldover-free maps in 50 lines of code, ACM TOG 40 (2021) 102, eqs. (2)-(4).
     """
@@ -54,9 +62,10 @@ def untangle(X: FloatArray, x: FloatArray, tets: IntArray, fixed: BoolArray) -> 
     areas = vertex_areas(X, boundary)
     best = target
     attempts = _INSIDE if fixed[areas > 0].all() else _SURFACE
-    for weight, rings in attempts:
+    for number, (weight, rings) in enumerate(attempts, 1):
         if not inverted.any() or _dets(best, tets, inverse).min() > 0:
             break
+        tell(f"inverted tets, attempt {number} of {len(attempts)}")
         movable = vertices_near(tets, inverted, len(X), rings) & ~fixed
         region = _region(tets, inverse, movable, areas / areas.sum(), weight)
         if np.isin(tets[inverted], region.free).any(axis=1).all():

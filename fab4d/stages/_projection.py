@@ -7,7 +7,7 @@ import numpy as np
 from fab4d.elasticity.elements import discretise
 from fab4d.elasticity.pattern import build_pattern, dirichlet_mask
 from fab4d.elasticity.projection import Bounds, DrawnBody
-from fab4d.elasticity.untangle import untangle
+from fab4d.elasticity.untangle import Tell, untangle
 from fab4d.mesh.interpolation import closest_shape
 from fab4d.mesh.measures import bounding_box_diagonal, deformation_gradients, tet_volumes, vertex_areas
 from fab4d.mesh.quality import largest_stretches
@@ -58,19 +58,21 @@ def share_of_volume(X: FloatArray, tets: IntArray, chosen: BoolArray) -> float:
 
 
 def relaxed_inside(
-    X: FloatArray, x: FloatArray, tets: IntArray, held: BoolArray, kappa: float, bounds: Bounds
+    X: FloatArray, x: FloatArray, tets: IntArray, held: BoolArray, kappa: float, bounds: Bounds, tell: Tell
 ) -> FloatArray:
     """x (n, 3), mm, with all vertices but the `held` (n,) ones where the elastic energy is least.
 
-    The given places of the moved vertices do not matter. kappa : bulk modulus over the shear modulus
+    The given places of the moved vertices do not matter.
+    kappa : bulk modulus over the shear modulus        tell : is told of each attempt
     A surface that leaves no room within the bounds is not worth the exact minimum: then the shape is only near it.
     """
     smooth = closest_shape(X, tets, np.zeros((len(tets), 3, 3)), np.flatnonzero(held), x)
-    start = untangle(X, np.where(held[:, None], x, smooth), tets, held)
+    start = untangle(X, np.where(held[:, None], x, smooth), tets, held, tell)
     if start.min_det_F <= 0 or held.all():
         return start.x
     x, none, no_bounds = start.x, np.zeros(len(X)), Bounds(0.0, np.inf)
     for most_steps in (_FIRST_STEPS, _MOST_STEPS):
+        tell(f"inside, at most {most_steps} steps")
         x = _drawn(X, x, x, tets, ~held, none, kappa, no_bounds, 0.0, 1e-10, most_steps)
         if measured(X, x, tets).beyond(bounds).any():
             break
@@ -78,15 +80,16 @@ def relaxed_inside(
 
 
 def nearest_within(
-    X: FloatArray, x: FloatArray, tets: IntArray, clamp: BoolArray, kappa: float, bounds: Bounds
+    X: FloatArray, x: FloatArray, tets: IntArray, clamp: BoolArray, kappa: float, bounds: Bounds, tell: Tell
 ) -> FloatArray:
     """The shape (n, 3), mm, within the bounds whose surface is near that of x (n, 3); vertices of `clamp` (n,) stay.
 
     Only vertices around tets beyond the bounds move, more of them where that is not enough. The result may be beyond
     the bounds: `measured` tells.
+    kappa : bulk modulus over the shear modulus        tell : is told of each attempt
     """
     beyond = measured(X, x, tets).beyond(bounds)
-    start = untangle(X, x, tets, clamp)
+    start = untangle(X, x, tets, clamp, tell)
     if not beyond.any() or start.min_det_F <= 0:
         return start.x
     pull = _PULL * vertex_areas(X, face_table(tets).boundary) / bounding_box_diagonal(X) ** 2
@@ -95,6 +98,7 @@ def nearest_within(
         free = vertices_near(tets, beyond, len(X), rings) & ~clamp
         nearest = start.x
         for strength in _STRENGTHS:
+            tell(f"surface, {int(free.sum())} vertices free, bounds at strength {strength:g}")
             nearest = _drawn(X, nearest, x, tets, free, pull, kappa, tight, strength, 1e-6)
             if not measured(X, nearest, tets).beyond(bounds).any():
                 return nearest

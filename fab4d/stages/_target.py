@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.elasticity.projection import Bounds
+from fab4d.elasticity.untangle import Tell, silent
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.distance import aligned
 from fab4d.mesh.doctor import Pair, wanted_clamp
@@ -38,11 +39,14 @@ class Target:
     projection: dict[str, Any] | None = None
 
 
-def reachable_target(pair: Pair, clamp: BoolArray, materials: MaterialCard, tolerance: float) -> Target:
+def reachable_target(
+    pair: Pair, clamp: BoolArray, materials: MaterialCard, tolerance: float, tell: Tell = silent
+) -> Target:
     """Put the temporary shape to the clamp, and project it where an elastic part cannot take it.
 
     Only the surface is wanted: an inside that is inverted, squeezed or stretched too far is relaxed anew. Where the
     surface itself asks too much, it moves as little as it must; an error when that is more than `tolerance`, RMS mm.
+    tell : is told of each attempt at that, for it may take long
     """
     pair, findings = _at_the_clamp(pair, clamp)
     wanted = pair.X_temp
@@ -50,7 +54,7 @@ def reachable_target(pair: Pair, clamp: BoolArray, materials: MaterialCard, tole
     bounds = Bounds(SMALLEST_DET_F, max(materials.smp_max_stretch, materials.tpe_max_stretch))
     before = measured(pair.X, held, pair.tets)
     if before.beyond(bounds).any():
-        x, error = _projected(pair, held, clamp, materials, bounds)
+        x, error = _projected(pair, held, clamp, materials, bounds, tell)
         if error:
             return Target(pair, [*findings, error])
         return _judged(pair, x, clamp, before, bounds, tolerance, findings)
@@ -61,13 +65,13 @@ def reachable_target(pair: Pair, clamp: BoolArray, materials: MaterialCard, tole
 
 
 def _projected(
-    pair: Pair, held: FloatArray, clamp: BoolArray, materials: MaterialCard, bounds: Bounds
+    pair: Pair, held: FloatArray, clamp: BoolArray, materials: MaterialCard, bounds: Bounds, tell: Tell
 ) -> tuple[FloatArray, Finding | None]:
     """`held` (n, 3) with its inside relaxed and, if it must be, its surface moved to within the bounds, or why not."""
     kappa = materials.tpe.kappa / materials.tpe.mu
     surface = np.zeros(len(pair.X), bool)
     surface[face_table(pair.tets).boundary] = True
-    x = relaxed_inside(pair.X, held, pair.tets, surface | clamp, kappa, bounds)
+    x = relaxed_inside(pair.X, held, pair.tets, surface | clamp, kappa, bounds, tell)
     relaxed = measured(pair.X, x, pair.tets)
     beyond = relaxed.beyond(bounds)
     if not beyond.any():
@@ -77,7 +81,7 @@ def _projected(
         middle = f"median det F {np.median(relaxed.det):.3g}, median stretch {np.median(relaxed.stretch):.3g}"
         message = f"{limits}, most of the part ({middle}); {_within(pair, x, clamp, bounds)}"
         return x, finding("unreachable", "error", pair.files[1], message, where)
-    x = nearest_within(pair.X, x, pair.tets, clamp, kappa, bounds)
+    x = nearest_within(pair.X, x, pair.tets, clamp, kappa, bounds, tell)
     left = measured(pair.X, x, pair.tets)
     if not left.beyond(bounds).any():
         return x, None

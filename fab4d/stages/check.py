@@ -69,7 +69,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     tolerance = _tolerance(profile["goal"], pair, clamp)
     if not nothing_to_program:
         monitor.progress("target")
-        target = reachable_target(pair, clamp, profile["materials"], tolerance)
+        target = reachable_target(
+            pair, clamp, profile["materials"], tolerance, lambda what: monitor.progress(f"target: {what}")
+        )
         findings += [*_refuse(target.findings), *_strong_deformation(target.pair, profile["materials"])]
         monitor.progress("outlook")
         suggested = None if clamp.any() else suggested_clamp(target.pair, tolerance, profile["units"])

@@ -340,6 +340,22 @@ def test_the_inside_of_the_temporary_shape_does_not_matter(seed: int) -> None:
     assert "X_wanted" not in first
 
 
+@pytest.mark.parametrize(
+    ("pinch", "first"), [(6.0, "target: inside, at most"), (12.0, "target: inverted tets, attempt 1 of")]
+)
+def test_each_attempt_at_a_target_that_takes_long_is_told(
+    monkeypatch: pytest.MonkeyPatch, pinch: float, first: str
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(SilentMonitor, "progress", lambda _, phase, **__: told.append(phase))
+    pinched = Y.copy()
+    pinched[SURFACE[np.argmax(Y[SURFACE, 0])], 0] -= pinch
+    check_points(X, pinched, tolerance=5.0)
+    attempts = told[told.index("target") + 1 : told.index("outlook")]
+    assert attempts[0].startswith(first)
+    assert attempts[-1].startswith("target: surface, 36 vertices free")
+
+
 def test_a_clamp_that_reaches_inside_is_told_by_its_surface() -> None:
     y = bent(np.maximum(X - [5, 0, 0], 0)) + np.minimum(X, [5, 0, 0]) * [1, 0, 0]
     wild = y.copy()
