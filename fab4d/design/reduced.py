@@ -250,7 +250,8 @@ def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     if not step.accepted or slow == 2 or at.iteration + 1 >= settings.relax_iterations:
         rms = shape_error(at.equilibria.problem, step.design.final.y).rms
         if at.stay and weights.error_scale < rms <= NEARLY * weights.error_scale:
-            return replace(after, stay=False, damping=FIRST_DAMPING, iteration=0, slow=0, exchanges=EXCHANGED - 1)
+            damping = min(step.damping, LARGEST_DAMPING)
+            return replace(after, stay=False, damping=damping, iteration=0, slow=0, exchanges=EXCHANGED - 1)
         rounding = replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, relaxed_rms=rms)
         return replace(rounding, iteration=0, slow=0)
     return replace(after, iteration=at.iteration + 1)

@@ -169,11 +169,12 @@ def test_steps_past_unstable_states_are_taken_where_the_tolerance_is_nearly_met(
 
     def refuse(*_: object, stay: bool = True) -> gauss_newton.Step:
         stays.append(stay)
-        return gauss_newton.Step(start.design, np.inf, 1.0, False)
+        return gauss_newton.Step(start.design, np.inf, 1e5, False)
 
     monkeypatch.setattr(reduced, "gauss_newton_step", refuse)
     after = relax_step(replace(start, exchanges=reduced.EXCHANGED), settings, L)
     assert after.phase is (Phase.RELAX if goes_on else Phase.ROUND)
+    assert after.damping <= reduced.LARGEST_DAMPING
     if goes_on:
         last = relax_step(replace(after, exchanges=reduced.EXCHANGED), settings, L)
         assert last.phase is Phase.ROUND
