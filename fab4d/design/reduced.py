@@ -25,8 +25,6 @@ FIRST_LAM_ROUND = 0.02
 # of the tolerance.
 EXCHANGE_AFTER, EXCHANGED, GOOD_ENOUGH = 3, 4, 0.25
 STEPS_AFTER_EXCHANGE = 2
-# Where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states.
-NEARLY = 1.5
 # Larger pads are taken where the pull on a small one is more than this share of the TPE's shear modulus: it dents the
 # surface and creases it at the rim.
 LARGEST_TRACTION = 0.25
@@ -48,7 +46,10 @@ FIRST_COUNT = 4
 @dataclass(frozen=True)
 class ReducedSettings:
     """Number of the patches and the radii (L0) to choose from, the objective, how long each phase may go on, and the
-    factor by which lam_round grows in each step."""
+    factor by which lam_round grows in each step.
+
+    nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
+    """
 
     n_points: int
     patch_radii: tuple[float, ...]
@@ -58,6 +59,7 @@ class ReducedSettings:
     round_iterations: int = 40
     undecided_fraction: float = 2e-4
     round_growth: float = 1.6
+    nearly: float = 1.5
 
 
 class Phase(Enum):
@@ -249,7 +251,7 @@ def relax_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
         return replace(after, phase=Phase.EXCHANGE, iteration=at.iteration + 1)
     if not step.accepted or slow == 2 or at.iteration + 1 >= settings.relax_iterations:
         rms = shape_error(at.equilibria.problem, step.design.final.y).rms
-        if at.stay and weights.error_scale < rms <= NEARLY * weights.error_scale:
+        if at.stay and weights.error_scale < rms <= settings.nearly * weights.error_scale:
             damping = min(step.damping, LARGEST_DAMPING)
             return replace(after, stay=False, damping=damping, iteration=0, slow=0, exchanges=EXCHANGED - 1)
         rounding = replace(after, phase=Phase.ROUND, lam_round=FIRST_LAM_ROUND, damping=FIRST_DAMPING, relaxed_rms=rms)

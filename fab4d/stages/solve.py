@@ -35,7 +35,8 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 CERTAINLY_ENOUGH, OUT_OF_REACH = 0.5, 1.25
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
 NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
-# Steps on more tets than this take minutes: they are rounded in about half the steps.
+# Steps on more tets than this take minutes, and those past unstable states many times that: such meshes are rounded in
+# about half the steps, none of which leads there.
 MANY_TETS, FAST_GROWTH = 60_000, 2.5
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
 # attempts as many times more.
@@ -283,7 +284,7 @@ def search_settings(
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )
-    return replace(settings, round_growth=FAST_GROWTH) if problem.n_tets > MANY_TETS else settings
+    return replace(settings, round_growth=FAST_GROWTH, nearly=1.0) if problem.n_tets > MANY_TETS else settings
 
 
 def _artifacts(

@@ -82,7 +82,8 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
     monkeypatch.setattr(solve, "MANY_TETS", problem.n_tets - 1)
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
-    assert replace(fast, round_growth=usual.round_growth) == usual
+    assert usual.nearly > fast.nearly == 1.0
+    assert replace(fast, round_growth=usual.round_growth, nearly=usual.nearly) == usual
 
 
 def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
