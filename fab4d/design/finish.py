@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import smoothness_matrix
@@ -17,10 +15,9 @@ from fab4d.design.reduced import (
     Phase,
     ReducedSettings,
     Search,
-    change_density,
+    decided,
     undecided_fraction,
 )
-from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import FloatArray
 
 # So many steps in a row that are not taken, or only with the largest damping, end the rounding: the equilibria turn
@@ -29,8 +26,6 @@ MOST_HELD_BACK = 3
 
 # The design is near already: a few steps relax it, and it is rounded in half the steps of a search from the start.
 RELAX_ITERATIONS, ROUND_GROWTH = 3, 2.5
-# Up to this share of undecided tets is rounded at once where the steps come to nothing.
-LAST_SHARE = 0.05
 
 Watch = Callable[[str, Search], None]
 
@@ -75,18 +70,4 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
         held_back = held_back + 1 if hard else 0
         if held_back == MOST_HELD_BACK:
             break
-    return _decided(at, settings.undecided_fraction)
-
-
-def _decided(at: Search, undecided: float) -> Search | None:
-    """The state with its last few densities rounded; None where more than those are left, or none holds them."""
-    left = undecided_fraction(at.design.rho)
-    if left <= undecided:
-        return at
-    if left > LAST_SHARE:
-        return None
-    try:
-        design = change_density(at.equilibria, at.design, np.round(at.design.rho))
-    except EquilibriumError:
-        return None
-    return replace(at, design=design, phase=Phase.DONE)
+    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else decided(at)

@@ -34,6 +34,8 @@ ROUNDING_LOSS = 2.5
 DEARER = 0.86
 # So many rounding steps in a row that are not taken end it: the equilibria turn unstable on its way.
 MOST_REFUSED = 3
+# Up to this share of undecided tets is rounded at once where the steps come to nothing.
+LAST_SHARE = 0.05
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -111,7 +113,8 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
         watch(at)
-    return at
+    done = undecided_fraction(at.design.rho) <= settings.undecided_fraction
+    return at if done else decided(at) or at
 
 
 def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
@@ -310,6 +313,17 @@ STEPS = {Phase.RELAX: relax_step, Phase.EXCHANGE: exchange_step, Phase.ROUND: ro
 def undecided_fraction(rho: FloatArray) -> float:
     """Share of tets whose density is neither 0 nor 1."""
     return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
+
+
+def decided(at: Search) -> Search | None:
+    """The state with its last few densities rounded; None where more than those are left, or none holds them."""
+    if undecided_fraction(at.design.rho) > LAST_SHARE:
+        return None
+    try:
+        design = change_density(at.equilibria, at.design, np.round(at.design.rho))
+    except EquilibriumError:
+        return None
+    return replace(at, design=design, phase=Phase.DONE)
 
 
 # -- refit

@@ -27,7 +27,8 @@ from fab4d.stages.threshold import labels_for
 
 # How often the held positions are fitted again after the loading has found another equilibrium than the fit.
 MOST_FITS = 3
-# Labels are flipped until the error is at most this multiple of that of the relaxed design.
+# Labels are flipped until the error is at most this multiple of that of the relaxed design, and meets the tolerance if
+# that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
 Polish = Callable[[Design], Design]
 
@@ -104,9 +105,17 @@ def _polish(
     trace: Trace,
 ) -> Callable[[Design], Design]:
     """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    target_rms = ALLOWED_LOSS * float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
-    settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], target_rms)
+    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
+    settings = flip_settings(
+        inputs["mesh"], profile["printer"], profile["goal"], flipped_down_to(relaxed_rms, weights.error_scale)
+    )
     return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
+
+
+def flipped_down_to(relaxed_rms: float, tolerance: float) -> float:
+    """The RMS error at which labels need no more flips; all three in the same unit."""
+    allowed = ALLOWED_LOSS * relaxed_rms
+    return min(allowed, tolerance) if relaxed_rms <= ALLOWED_LOSS * tolerance else allowed
 
 
 def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Goal, target_rms: float) -> FlipSettings:

@@ -281,6 +281,23 @@ def test_rounding_ends_where_no_step_is_taken(
     assert found.design is before.design
 
 
+@pytest.mark.parametrize(("undecided", "rounded"), [(4, True), (12, False)])
+def test_the_last_few_densities_are_rounded_at_once(
+    truth: Truth, searched: list[Search], undecided: int, rounded: bool
+) -> None:
+    """Four of 120 tets are few where the steps have come to nothing, twelve are a design that is not 0 or 1."""
+    last, problem = searched[-1], truth.problem
+    rho = np.round(last.design.rho)
+    rho[:undecided] = np.abs(rho[:undecided] - 0.3)
+    ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
+    found = solve_reduced(problem, settings_for(problem), lambda at: None, ended)  # noqa: ARG005
+    if not rounded:
+        assert found is ended
+        return
+    np.testing.assert_array_equal(found.design.rho, np.round(rho))
+    assert balance(found.equilibria, found.design.rho, found.design.median, found.design.final).final < 1e-5
+
+
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
     """With the true labels and points there is one answer, and the error goes to rounding."""
     problem, equilibria, true = truth.problem, truth.equilibria, truth.design

@@ -101,3 +101,16 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
     monkeypatch.setattr(refit, "polish_labels", spy)
     refit.run(inputs, PROFILE, SilentMonitor())
     assert targets == [pytest.approx(1.15 * float(inputs["relaxed"]["relaxed_rms"]))]
+
+
+@pytest.mark.parametrize(
+    ("relaxed_rms", "down_to"),
+    [
+        (0.5, 0.575),  # far below the tolerance: the share above the relaxed error
+        (0.95, 1.0),  # the tolerance comes first
+        (1.1, 1.0),  # flips may win what the relaxed design lacks
+        (1.2, 1.38),  # out of reach: no more work than that of rounding
+    ],
+)
+def test_labels_are_flipped_until_the_tolerance_is_met_where_it_is_near(relaxed_rms: float, down_to: float) -> None:
+    assert refit.flipped_down_to(relaxed_rms, 1.0) == pytest.approx(down_to)
