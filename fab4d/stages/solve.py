@@ -215,13 +215,18 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor, b
 def _hopeless(profile: Mapping[str, Any], settings: ReducedSettings, found: Search) -> bool:
     """Whether other attempts, which make rounding cost less, cannot help: the relaxed design misses the tolerance."""
     asked = profile["goal"].max_forces is not None or settings.n_points == profile["rig"].max_points
-    return asked and found.relaxed_rms > settings.weights.error_scale
+    return asked and _reached(found) > settings.weights.error_scale
+
+
+def _reached(found: Search) -> float:
+    """The RMS error, L0, of the relaxed design, or of the rounded one where rounding has gone on to lower it."""
+    return min(found.relaxed_rms, _rms(found))
 
 
 def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> str | None:
     """What keeps the relaxed design, each tet any mixture, from the goal; None where it comes near enough."""
     weights = search_settings(problem, profile).weights
-    if found.relaxed_rms <= weights.error_scale:
+    if _reached(found) <= weights.error_scale:
         return None
     median, patches, limits = found.design.median, found.equilibria.patches, []
     if (force_excess(median.forces, weights.max_force) > 0).any():
@@ -234,7 +239,7 @@ def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> 
     error = shape_error(problem, found.design.final.y).e
     worst = problem.body.X[np.argmax(np.linalg.norm(error, axis=1))] * problem.length
     place = ", ".join(f"{x:.3g}" for x in worst)
-    left = found.relaxed_rms * problem.length
+    left = _reached(found) * problem.length
     return (
         f"{what}: with any mixture of materials in each tet the error stays at {left:.3g} mm, "
         f"most of all near ({place}) mm of the printed part"

@@ -64,6 +64,18 @@ def test_a_rig_that_only_pulls_is_named_where_that_limits(bar: dict[str, np.ndar
     assert "pulls" not in solved(shorter, goal)["solve_report"]["limited_by"]
 
 
+@pytest.mark.parametrize(("moved", "relaxed_rms", "limited"), [(0.0, 1.0, False), (1.0, 0.0, False), (1.0, 1.0, True)])
+def test_a_design_is_limited_where_it_misses_the_tolerance_relaxed_and_rounded(
+    bar: dict[str, np.ndarray], moved: float, relaxed_rms: float, limited: bool
+) -> None:
+    """Rounding may go on to lower the error. The part at rest is off by what it has to move."""
+    mesh = bar | {"X_temp": bar["X"] + moved * (bar["X_temp"] - bar["X"])}
+    problem, profile = problem_of(mesh, PROFILE["materials"], "linear"), PROFILE | {"goal": Goal(0.6, 3)}
+    found = replace(at_rest(problem), relaxed_rms=relaxed_rms)
+    assert solve._hopeless(profile, search_settings(problem, profile), found) == limited
+    assert (solve._limited_by(problem, profile, found) is not None) == limited
+
+
 @pytest.mark.parametrize("share", [1.0, 0.1])
 def test_solver_and_verdict_mean_the_same_by_a_goal_without_a_tolerance(
     bar: dict[str, np.ndarray], share: float
