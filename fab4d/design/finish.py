@@ -16,7 +16,6 @@ from fab4d.design.reduced import (
     ReducedSettings,
     Search,
     decided,
-    undecided_fraction,
 )
 from fab4d.mesh.tetmesh import FloatArray
 
@@ -70,4 +69,4 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
         held_back = held_back + 1 if hard else 0
         if held_back == MOST_HELD_BACK:
             break
-    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else decided(at)
+    return decided(at, settings.undecided_fraction)

@@ -113,8 +113,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
         watch(at)
-    done = undecided_fraction(at.design.rho) <= settings.undecided_fraction
-    return at if done else decided(at) or at
+    return decided(at, settings.undecided_fraction) or at
 
 
 def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
@@ -315,9 +314,15 @@ def undecided_fraction(rho: FloatArray) -> float:
     return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
 
 
-def decided(at: Search) -> Search | None:
-    """The state with its last few densities rounded; None where more than those are left, or none holds them."""
-    if undecided_fraction(at.design.rho) > LAST_SHARE:
+def decided(at: Search, undecided: float) -> Search | None:
+    """The state with its last few densities rounded, as it is where that share of the tets or less is `undecided`.
+
+    None where more than LAST_SHARE is left, or no equilibrium holds them.
+    """
+    left = undecided_fraction(at.design.rho)
+    if left <= undecided:
+        return at
+    if left > LAST_SHARE:
         return None
     try:
         design = change_density(at.equilibria, at.design, np.round(at.design.rho))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.elasticity.projection import Bounds
-from fab4d.elasticity.untangle import Tell, silent
+from fab4d.elasticity.untangle import Tell
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.distance import aligned
 from fab4d.mesh.doctor import Pair, wanted_clamp
@@ -39,9 +39,7 @@ class Target:
     projection: dict[str, Any] | None = None
 
 
-def reachable_target(
-    pair: Pair, clamp: BoolArray, materials: MaterialCard, tolerance: float, tell: Tell = silent
-) -> Target:
+def reachable_target(pair: Pair, clamp: BoolArray, materials: MaterialCard, tolerance: float, tell: Tell) -> Target:
     """Put the temporary shape to the clamp, and project it where an elastic part cannot take it.
 
     Only the surface is wanted: an inside that is inverted, squeezed or stretched too far is relaxed anew. Where the
