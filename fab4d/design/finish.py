@@ -22,7 +22,9 @@ from fab4d.mesh.tetmesh import FloatArray
 # So many steps in a row that are not taken, or only with the largest damping, end the rounding: the equilibria turn
 # unstable on its way.
 MOST_HELD_BACK = 3
-
+# Up to this share of undecided tets is rounded at once where the steps come to nothing; with more left, the design that
+# other elements have rounded is the better one.
+LAST_SHARE = 0.05
 # The design is near already: a few steps relax it, and it is rounded in half the steps of a search from the start.
 RELAX_ITERATIONS, ROUND_GROWTH = 3, 2.5
 
@@ -69,4 +71,4 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
         held_back = held_back + 1 if hard else 0
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings.undecided_fraction)
+    return decided(at, settings.undecided_fraction, LAST_SHARE)

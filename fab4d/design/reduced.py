@@ -32,10 +32,9 @@ LARGEST_TRACTION = 0.25
 ROUNDING_LOSS = 2.5
 # While there is too much SMP, its price grows by this power of the growth of lam_round.
 DEARER = 0.86
-# So many rounding steps in a row that are not taken end it: the equilibria turn unstable on its way.
-MOST_REFUSED = 3
-# Up to this share of undecided tets is rounded at once where the steps come to nothing.
-LAST_SHARE = 0.05
+# So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
+# that are not taken, or taken with the largest damping and less than this share of the undecided tets decided.
+MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -78,7 +77,7 @@ class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
     patch_radius : L0        phase : of the next step
-    iteration, slow : steps of this phase, and how many of the last gained little, or while rounding nothing
+    iteration, slow : steps of this phase, and how many of the last gained little, or while rounding were stuck
     exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
     stay : whether steps whose way leads past unstable states are given up
@@ -280,18 +279,18 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
 
 
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
-    """Raise lam_round until all but a few densities are 0 or 1, held positions following, or no step is taken."""
+    """Raise lam_round until all but a few densities are 0 or 1, held positions following, or steps come to nothing."""
     too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
     lam_SMP = settings.round_growth**DEARER * at.lam_SMP if too_much else at.lam_SMP
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
     scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
     weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping, stay=at.stay)
-    slow = 0 if step.accepted else at.slow + 1
+    before, left = undecided_fraction(at.design.rho), undecided_fraction(step.design.rho)
+    stuck = not step.accepted or (step.damping >= LARGEST_DAMPING and left > (1 - LEAST_DECIDED) * before)
+    slow = at.slow + 1 if stuck else 0
     finished = (
-        undecided_fraction(step.design.rho) <= settings.undecided_fraction
-        or at.iteration + 1 == settings.round_iterations
-        or slow == MOST_REFUSED
+        left <= settings.undecided_fraction or at.iteration + 1 == settings.round_iterations or slow == MOST_STUCK
     )
     return replace(
         at,
@@ -314,15 +313,15 @@ def undecided_fraction(rho: FloatArray) -> float:
     return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
 
 
-def decided(at: Search, undecided: float) -> Search | None:
-    """The state with its last few densities rounded, as it is where that share of the tets or less is `undecided`.
+def decided(at: Search, undecided: float, most: float = 1.0) -> Search | None:
+    """The state with its densities rounded at once, as it is where that share of the tets or less is `undecided`.
 
-    None where more than LAST_SHARE is left, or no equilibrium holds them.
+    None where more than the share `most` is left, or no equilibrium holds them.
     """
     left = undecided_fraction(at.design.rho)
     if left <= undecided:
         return at
-    if left > LAST_SHARE:
+    if left > most:
         return None
     try:
         design = change_density(at.equilibria, at.design, np.round(at.design.rho))

@@ -5,13 +5,13 @@ import pytest
 from bars import bar
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.finish import carried_over, rounded_in
+from fab4d.design.finish import LAST_SHARE, carried_over, rounded_in
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import LAST_SHARE, Phase, ReducedSettings, Search, relaxed, undecided_fraction
+from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed, undecided_fraction
 
 TOLERANCE = 5e-3
 WEIGHTS = ObjectiveWeights(error_scale=TOLERANCE, lam_SMP=0.05, lam_smooth=0.3)

@@ -19,6 +19,7 @@ from fab4d.design.reduced import (
     Search,
     at_rest,
     change_density,
+    decided,
     fewest_points,
     first_search,
     largest_traction,
@@ -26,6 +27,7 @@ from fab4d.design.reduced import (
     refit,
     relax_step,
     relaxed,
+    round_step,
     solve_reduced,
     undecided_fraction,
 )
@@ -266,7 +268,7 @@ def test_going_on_from_any_state_ends_with_the_same_bits(truth: Truth, searched:
 def test_rounding_ends_where_no_step_is_taken(
     truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One step that is refused is followed by others; three in a row end it, with the best state so far."""
+    """One step that is refused is followed by others; three in a row end it, and the best state is rounded at once."""
     before = next(at for at in searched if at.phase is Phase.ROUND and at.iteration == 2)
     refused: list[int] = []
 
@@ -278,24 +280,41 @@ def test_rounding_ends_where_no_step_is_taken(
     found = solve_reduced(truth.problem, settings_for(truth.problem), lambda at: None, before)  # noqa: ARG005
     assert len(refused) == 3
     assert found.phase is Phase.DONE
-    assert found.design is before.design
+    np.testing.assert_array_equal(found.design.rho, np.round(before.design.rho))
 
 
-@pytest.mark.parametrize(("undecided", "rounded"), [(4, True), (12, False)])
-def test_the_last_few_densities_are_rounded_at_once(
-    truth: Truth, searched: list[Search], undecided: int, rounded: bool
+@pytest.mark.parametrize(("decided_each", "steps"), [(1, 3), (3, 40)])
+def test_rounding_ends_where_steps_decide_nothing(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, decided_each: int, steps: int
 ) -> None:
-    """Four of 120 tets are few where the steps have come to nothing, twelve are a design that is not 0 or 1."""
+    """Steps held back by the largest damping go on as long as each decides a few per cent of the 120 tets."""
+    before = next(at for at in searched if at.phase is Phase.ROUND)
+    taken: list[int] = []
+
+    def decide(_: object, __: object, ___: object, design: Design, *____: object, **_____: object) -> gauss_newton.Step:
+        taken.append(1)
+        rho = np.where(np.arange(truth.problem.n_tets) < decided_each * len(taken), 1.0, 0.5)
+        return gauss_newton.Step(replace(design, rho=rho), 0.0, reduced.LARGEST_DAMPING, True)
+
+    monkeypatch.setattr(reduced, "gauss_newton_step", decide)
+    open_design = replace(before.design, rho=np.full(truth.problem.n_tets, 0.5))
+    at, L = replace(before, design=open_design, iteration=0, slow=0), smoothness_matrix(truth.problem)
+    while at.phase is Phase.ROUND:
+        at = round_step(at, settings_for(truth.problem), L)
+    assert len(taken) == steps
+
+
+def test_densities_left_undecided_are_rounded_at_once(truth: Truth, searched: list[Search]) -> None:
+    """Where the steps have come to nothing; but only up to a share, if one is given."""
     last, problem = searched[-1], truth.problem
     rho = np.round(last.design.rho)
-    rho[:undecided] = np.abs(rho[:undecided] - 0.3)
+    rho[:12] = np.abs(rho[:12] - 0.3)
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
     found = solve_reduced(problem, settings_for(problem), lambda at: None, ended)  # noqa: ARG005
-    if not rounded:
-        assert found is ended
-        return
     np.testing.assert_array_equal(found.design.rho, np.round(rho))
     assert balance(found.equilibria, found.design.rho, found.design.median, found.design.final).final < 1e-5
+    assert decided(ended, 2e-4, 12 / 120) is not None
+    assert decided(ended, 2e-4, 11 / 120) is None
 
 
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
