@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -84,20 +85,32 @@ def tau_seconds(problem: Problem, repeats: int = 3) -> float:
     return min(times)
 
 
+@dataclass
+class _Log:
+    """The rows of error-vs-time.csv, and when its clock stood at zero."""
+
+    start: float
+    rows: list[dict[str, Any]]
+
+
 class Trace:
     """Rows of error-vs-time.csv, one for each iterate shown to it; tells the monitor of each."""
 
     def __init__(self, problem: Problem, mesh: Mapping[str, np.ndarray], monitor: Monitor, tau_s: float) -> None:
         self._problem, self._mesh, self._monitor, self._tau_s = problem, mesh, monitor, tau_s
         self._areas = vertex_areas(mesh["X"], problem.faces)
-        self._start = time.perf_counter()
-        self.rows: list[dict[str, Any]] = []
+        self._log = _Log(time.perf_counter(), [])
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """All rows so far."""
+        return self._log.rows
 
     def add(self, phase: str, at: Search) -> None:
         """Measure the true error of the design and append its row, unless the last step changed nothing."""
         if not at.accepted:
             return
-        wall_s = time.perf_counter() - self._start
+        wall_s = time.perf_counter() - self._log.start
         n, design, problem = len(self._mesh["X"]), at.design, self._problem
         error = shape_error(design.final.y[:n] * problem.length, self._mesh["X_temp"], problem.faces, self._areas)
         row: dict[str, Any] = {
@@ -117,14 +130,20 @@ class Trace:
             phase, rms_mm=error.rms, forces=row["forces"], smp_fraction=row["smp_fraction"], tau=row["tau"]
         )
 
+    def on(self, problem: Problem, mesh: Mapping[str, np.ndarray]) -> "Trace":
+        """The same rows and clock for iterates on another mesh of the part, measured there."""
+        other = Trace(problem, mesh, self._monitor, self._tau_s)
+        other._log = self._log
+        return other
+
     def go_on(self, csv: bytes) -> None:
         """Take over the rows of an interrupted run; its time counts."""
-        self.rows = [
+        self._log.rows = [
             {key: value if key in ("solver", "phase") else float(value) for key, value in row.items()}
             for row in read_csv(csv, TRACE_COLUMNS, "checkpoint")
         ]
         if self.rows:
-            self._start -= self.rows[-1]["wall_s"]
+            self._log.start -= self.rows[-1]["wall_s"]
 
     def csv(self) -> bytes:
         """The rows as CSV with a header."""

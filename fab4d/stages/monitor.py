@@ -1,6 +1,7 @@
 """How a running stage reports progress and keeps what it has, without knowing terminals or files."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -30,3 +31,20 @@ class SilentMonitor:
 
     def restore(self, name: str) -> dict[str, np.ndarray] | None:  # noqa: ARG002
         return None
+
+
+@dataclass(frozen=True)
+class Prefixed:
+    """The monitor of a part of a stage: the names of what it keeps begin with `prefix`."""
+
+    monitor: Monitor
+    prefix: str
+
+    def progress(self, phase: str, **values: float) -> None:
+        self.monitor.progress(phase, **values)
+
+    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
+        self.monitor.save(self.prefix + name, arrays)
+
+    def restore(self, name: str) -> dict[str, np.ndarray] | None:
+        return self.monitor.restore(self.prefix + name)

@@ -9,18 +9,20 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.finish import rounded_in
+from fab4d.design.levels import carried_up
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
-from fab4d.errors import SceneError
+from fab4d.errors import EquilibriumError, SceneError
 from fab4d.io.scene import Goal, RigCard, Weights
+from fab4d.stages._coarse import MANY_TETS, coarse_for
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
 from fab4d.stages._repair import repaired
 from fab4d.stages._search import search_arrays, search_from
-from fab4d.stages.monitor import Monitor
+from fab4d.stages.monitor import Monitor, Prefixed
 
 CHECKPOINT, BEST, POINTS = "iterate", "best", "points"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
@@ -35,9 +37,9 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 CERTAINLY_ENOUGH, OUT_OF_REACH = 0.5, 1.25
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
 NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
-# Steps on more tets than this take minutes, and those past unstable states many times that: such meshes are rounded in
-# about half the steps, none of which leads there.
-MANY_TETS, FAST_GROWTH = 60_000, 2.5
+# Where MANY_TETS are searched, for no coarser mesh does, they are rounded in about half the steps, none of which leads
+# past unstable states: that takes many times longer.
+FAST_GROWTH = 2.5
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
 # attempts as many times more.
 RELAXED_SHARE = 0.6
@@ -62,6 +64,22 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     if inputs["picked"] is not None:
         return _picked(problem, inputs, profile, trace, tau_s)
     element, _ = element_for(mesh, profile["solver"].element)
+    found, report = (
+        _designed_coarse(problem, mesh, profile, element, trace, monitor)
+        or _designed(problem, mesh, profile, element, trace, monitor)
+    )  # fmt: skip
+    return _artifacts(mesh, profile, found, trace, {"tau_s": tau_s, "iterations": len(trace.rows)} | report)
+
+
+def _designed(
+    problem: Problem,
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    element: str,
+    trace: Trace,
+    monitor: Monitor,
+) -> tuple[Search, dict[str, Any]]:
+    """The design of all attempts, with the least SMP if the goal asks for that, and what the report says of it."""
     searched = _search(problem, mesh, profile, element, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
@@ -71,15 +89,44 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         searched = replace(searched, found=least.found, printed_rms=least.printed_rms, finished=finished)
     rms = searched.printed_rms
     report = {
-        "tau_s": tau_s,
-        "iterations": len(trace.rows),
         "attempts": searched.attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "least_smp": None if least is None else least.trials,
         "limited_by": _limited_by(problem, profile, searched.found),
         "left_out": LEFT_OUT + searched.left_out,
     }
-    return _artifacts(mesh, profile, searched.finished or searched.found, trace, report)
+    return searched.finished or searched.found, report
+
+
+def _designed_coarse(
+    problem: Problem,
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    element: str,
+    trace: Trace,
+    monitor: Monitor,
+) -> tuple[Search, dict[str, Any]] | None:
+    """As `_designed`, on a coarser mesh and carried over.
+
+    None where the mesh is small, or where the coarser one or the way back finds no equilibrium: the whole mesh is then
+    searched, which takes longer.
+    """
+    coarse = coarse_for(problem, mesh, profile["materials"], element, monitor)
+    if coarse is None:
+        return None
+    level = coarse.level
+    own = trace.on(level.coarse, coarse.mesh)
+    try:
+        found, report = _designed(level.coarse, coarse.mesh, profile, "linear", own, Prefixed(monitor, "coarse-"))
+    except EquilibriumError:
+        return None
+    carried = carried_up(level, found)
+    if carried is None:
+        return None
+    trace.add("carried over", carried)
+    why = f"the design is found on {level.coarse.n_tets} tets of the same part and carried over"
+    left_out = [*report["left_out"], {"what": f"search on all {problem.n_tets} tets", "why": why}]
+    return carried, report | {"left_out": left_out}
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,18 +6,26 @@ from typing import Any
 import numpy as np
 import pytest
 from bent_bar import PROFILE, bent_bar
+from shapes.boxes import box
 
+from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, at_rest
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
-from fab4d.stages import solve
+from fab4d.stages import _coarse, solve
 from fab4d.stages._design import problem_of
 from fab4d.stages._figures import limits_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run, search_settings
 
 QUADRATIC = SolverSettings(element="quadratic")
+
+
+@pytest.fixture(scope="module")
+def fine_bar() -> dict[str, np.ndarray]:
+    """The same, of many tets."""
+    return bent_bar((24, 5, 4), 50.0)
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +152,71 @@ def test_a_goal_far_out_of_reach_is_not_rounded_in_quadratic_elements(bar: dict[
     assert b"carried over" not in phases(found)
     linear = solved(bar, Goal(tolerance=0.01, max_forces=1))
     assert solve.NOT_QUADRATIC not in linear["solve_report"]["left_out"]
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than 1,000 tets are many, and 400 are enough to search on."""
+    monkeypatch.setattr(_coarse, "MANY_TETS", 1_000)
+    monkeypatch.setattr(_coarse, "COARSE_TETS", 400)
+
+
+@pytest.mark.usefixtures("few")
+def test_many_tets_are_searched_on_a_coarser_mesh(fine_bar: dict[str, np.ndarray]) -> None:
+    """The design is in equilibrium on the whole mesh, near 0 or 1 in all its tets, and not far from the goal."""
+    found = solved(fine_bar, Goal(tolerance=0.6, max_forces=4))
+    relaxed, report = found["relaxed"], found["solve_report"]
+    assert relaxed["rho"].shape == (len(fine_bar["tets"]),)
+    assert np.isin(np.round(relaxed["rho"], 2), (0.0, 1.0)).mean() > 0.99
+    assert relaxed["x"].shape == fine_bar["X"].shape
+    assert len(relaxed["patch_center"]) == 4
+    assert b"carried over" in found["solve_trace"]
+    assert any(left["what"] == f"search on all {len(fine_bar['tets'])} tets" for left in report["left_out"])
+    problem = problem_of(fine_bar, PROFILE["materials"], "linear")
+    assert shape_error(problem, relaxed["y"] / problem.length).rms * problem.length < 1.5
+
+
+@pytest.mark.usefixtures("few")
+def test_a_design_that_is_lost_on_the_whole_mesh_is_searched_there(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solve, "carried_up", lambda *_: None)
+    found = solved(fine_bar, Goal(tolerance=0.6, max_forces=4))
+    assert found["relaxed"]["rho"].shape == (len(fine_bar["tets"]),)
+    assert not any(left["what"].startswith("search on") for left in found["solve_report"]["left_out"])
+
+
+@pytest.mark.usefixtures("few")
+def test_quadratic_elements_keep_to_their_mesh(fine_bar: dict[str, np.ndarray]) -> None:
+    problem = problem_of(fine_bar, PROFILE["materials"], "linear")
+    assert _coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "quadratic", SilentMonitor()) is None
+    assert _coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "linear", SilentMonitor()) is not None
+
+
+def test_a_plate_too_thin_to_coarsen_is_searched_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    X, tets = box((60.0, 40.0, 1.0), (12, 8, 1), "five")
+    plate = {"X": X, "X_temp": X, "tets": tets, "clamp": X[:, 0] <= 5.0}
+    monkeypatch.setattr(_coarse, "MANY_TETS", 100)
+    monkeypatch.setattr(_coarse, "COARSE_TETS", 400)
+    problem = problem_of(plate, PROFILE["materials"], "linear")
+    assert _coarse.coarse_for(problem, plate, PROFILE["materials"], "linear", SilentMonitor()) is None
+
+
+@pytest.mark.usefixtures("few")
+def test_a_coarse_search_that_was_stopped_goes_on(fine_bar: dict[str, np.ndarray]) -> None:
+    """What it keeps has names of its own: a search on the whole mesh that follows does not take it for its own."""
+    kept: dict[str, Any] = {}
+
+    class Keeping(SilentMonitor):
+        def save(self, name: str, arrays: Any) -> None:
+            kept[name] = arrays
+
+        def restore(self, name: str) -> Any:
+            return kept.get(name)
+
+    inputs = {"mesh": fine_bar, "check_report": {"nothing_to_program": False}, "picked": None}
+    profile = PROFILE | {"goal": Goal(tolerance=0.6, max_forces=4)}
+    first = run(inputs, profile, Keeping())
+    assert {name.split("-")[0] for name in kept} == {"coarse"}
+    again = run(inputs, profile, Keeping())
+    np.testing.assert_array_equal(first["relaxed"]["rho"], again["relaxed"]["rho"])

@@ -1,0 +1,46 @@
+"""The coarser mesh on which designs of large meshes are searched."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fab4d.design.levels import Level, level_of
+from fab4d.design.problem import Problem
+from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.coarsening import coarsened
+from fab4d.stages._design import problem_of
+from fab4d.stages.monitor import Monitor
+
+# Meshes of more tets are searched on a coarser one of so many: steps on them take minutes, and hardly lead anywhere
+# where squeezed surfaces turn unstable in waves that coarse meshes are too stiff for.
+MANY_TETS, COARSE_TETS = 60_000, 20_000
+# Coarser meshes that keep more than this share of the tets, for thin walls, gain nothing.
+MOST_KEPT = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Coarse:
+    """The coarse mesh, as the arrays X, X_temp, tets and clamp of the `mesh` artifact, and its level."""
+
+    mesh: dict[str, np.ndarray]
+    level: Level
+
+
+def coarse_for(
+    problem: Problem, mesh: Mapping[str, np.ndarray], materials: MaterialCard, element: str, monitor: Monitor
+) -> Coarse | None:
+    """The coarse mesh for the search on `problem`, of linear elements; None where the search is on the mesh itself.
+
+    element : of the last fit
+    """
+    if element != "linear" or problem.n_tets <= MANY_TETS:
+        return None
+    monitor.progress("coarsen")
+    X, X_temp, clamp = mesh["X"], mesh["X_temp"], mesh["clamp"]
+    found = coarsened(X, X_temp, mesh["tets"], clamp, COARSE_TETS)
+    if len(found.tets) > MOST_KEPT * problem.n_tets:
+        return None
+    kept = found.vertices
+    arrays = {"X": X[kept], "X_temp": X_temp[kept], "tets": found.tets, "clamp": clamp[kept]}
+    return Coarse(arrays, level_of(problem_of(arrays, materials, "linear"), problem, kept))
