@@ -26,6 +26,8 @@ MODE_DEGREE = 3
 FIRST_BATCH, LARGEST_BATCH = 40, 200
 # A flip has to lower the predicted squared error by this share of it, a round the objective by this one.
 LEAST_GAIN, LEAST_ROUND_GAIN = 1e-3, 1e-2
+# Of more tets than this, in proportion more are flipped at once, each for a smaller gain.
+USUAL_TETS = 5_000
 # A whole flip changes the shape by another amount than the derivative says: less when stiff SMP comes in, more when it
 # goes. The first guesses are corrected by each round.
 FIRST_FACTORS = (0.25, 1.0)
@@ -80,7 +82,8 @@ def polish_labels(
     L, start = smoothness_matrix(equilibria.problem), design
     plain = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
     value = evaluate(equilibria, plain, L, design)
-    factors, batch, poor = np.array(FIRST_FACTORS), FIRST_BATCH, 0
+    finer = fineness(equilibria.problem)
+    factors, batch, poor = np.array(FIRST_FACTORS), int(FIRST_BATCH * finer), 0
     for _ in range(settings.rounds):
         if not batch or poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
             break
@@ -96,11 +99,16 @@ def polish_labels(
         factors = _corrected(factors, modes, design, printed, equilibria.problem)
         new = evaluate(equilibria, plain, L, fitted)
         poor = poor + 1 if new > (1 - LEAST_ROUND_GAIN) * value else 0
-        batch = min(batch * 3 // 2, LARGEST_BATCH) if new < value else max(batch // 3, 1)
+        batch = min(batch * 3 // 2, int(LARGEST_BATCH * finer)) if new < value else max(batch // 3, 1)
         if new < value:
             design, value = fitted, new
             watch(Search(equilibria, design))
     return refit(equilibria, design, weights, watch) if design is not start else start
+
+
+def fineness(problem: Problem) -> float:
+    """How many times more tets than USUAL_TETS there are, 1 at least."""
+    return max(problem.n_tets / USUAL_TETS, 1.0)
 
 
 def _flipped(
@@ -165,13 +173,13 @@ def choose_flips(
     tets = np.flatnonzero(at_interface(problem, labels))
     change, residual = _predicted(modes, tets, np.where(labels[tets], -factors[1], factors[0]))
     own, usable = (change**2).sum(axis=1), np.ones(len(tets), bool)
-    chosen: list[int] = []
+    chosen, least = list[int](), LEAST_GAIN / fineness(problem)
     volumes = problem.volume_fractions[tets]
     while len(chosen) < most:
         room = settings.max_smp_fraction - problem.volume_fractions @ labels
         allowed = usable & at_interface(problem, labels)[tets] & (labels[tets] | (volumes <= room))
         gain = np.where(allowed, -2 * change @ residual - own, 0.0)
-        worth = np.flatnonzero(gain > LEAST_GAIN * (residual @ residual))
+        worth = np.flatnonzero(gain > least * (residual @ residual))
         ranked = worth[np.argsort(-gain[worth])]
         best = next((k for k in ranked if settings.flippable(labels, int(tets[k]))), None)
         if best is None:

@@ -175,3 +175,25 @@ def test_flips_that_are_chosen_lower_the_predicted_error() -> None:
     change, error = whole_flips(modes, rho)
     chosen = choose_flips(problem, modes, rho, np.array(flips.FIRST_FACTORS), FREELY, 5)
     assert np.linalg.norm(error + change[chosen].sum(axis=0)) < np.linalg.norm(error)
+
+
+def test_of_smaller_tets_more_are_flipped_for_less_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the bar's tets were four times as many as usual."""
+    problem = bar(cells=(6, 3, 2), degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    rho, factors = smp.astype(np.float64), np.array(flips.FIRST_FACTORS)
+    design = held_design(equilibria, rho, problem.X_temp)
+    modes = modes_at(equilibria, design)
+    monkeypatch.setattr(flips, "LEAST_GAIN", 0.05)
+    few = choose_flips(problem, modes, rho, factors, FREELY, 1000)
+    asked: list[int] = []
+
+    def none_chosen(*args: object) -> np.ndarray:
+        asked.append(int(str(args[-1])))
+        return np.zeros(0, np.int64)
+
+    monkeypatch.setattr(flips, "USUAL_TETS", problem.n_tets / 4)
+    assert len(choose_flips(problem, modes, rho, factors, FREELY, 1000)) > 2 * len(few)
+    monkeypatch.setattr(flips, "choose_flips", none_chosen)
+    polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    assert asked == [4 * flips.FIRST_BATCH]
