@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -38,9 +39,19 @@ def program(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: Floa
     rho : (m,) printed labels, 0 or 1        x : (N, 3), forces : (K, 3) the state that the rig is to reach
     The patches move along the path of `mesh.interpolation`; only their mean positions are taken from it.
     """
-    median, steps, loaded = _load(equilibria, rho, x, forces)
+    median, steps, loaded = load(equilibria, rho, x, forces)
     final, more, unloaded = _unload(equilibria, rho, median)
     return Programming(median, final, steps + more, loaded, unloaded)
+
+
+def programmed_to(
+    equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray, y: FloatArray, load_steps: int
+) -> Programming:
+    """The programming that went all the way to these median and final shapes (N, 3), which are solved to the end."""
+    held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
+    median = equilibria.solve_median(rho, held, x, forces, END_TOLERANCE, END_ITERATIONS)
+    final = equilibria.solve_final(rho, median, y, END_TOLERANCE, END_ITERATIONS)
+    return Programming(median, final, load_steps, 1.0, 1.0)
 
 
 def same_shape(done: Programming, x: FloatArray) -> bool:
@@ -49,13 +60,15 @@ def same_shape(done: Programming, x: FloatArray) -> bool:
     return done.loaded == 1.0 and done.unloaded == 1.0 and distance <= SAME_SHAPE
 
 
-def _load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray) -> tuple[Median, int, float]:
+def load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray) -> tuple[Median, int, float]:
+    """The median shape that loading ends in, the load steps made, and how far it came; see `program`."""
     problem, patches = equilibria.problem, equilibria.patches
     corners = problem.body.elements[:, :4]
     n = int(corners.max()) + 1
     path = shape_path(problem.body.X[:n], x[:n], corners, problem.clamp[:n])
     correction = patches.mean(x) + RIG_COMPLIANCE * forces - patches.mean(at_nodes(problem, path.at(1.0)))
 
+    @lru_cache(maxsize=2)
     def held(t: float) -> FloatArray:
         return patches.mean(at_nodes(problem, path.at(t))) + t * correction
 

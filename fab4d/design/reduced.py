@@ -9,13 +9,14 @@ from scipy.sparse import csr_array
 
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.exchange import exchanged
+from fab4d.design.forward import load
 from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, gauss_newton_step, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.measures import face_area_vectors
-from fab4d.mesh.tetmesh import FloatArray
+from fab4d.mesh.tetmesh import FloatArray, IntArray
 
 START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
@@ -44,12 +45,13 @@ SLOW_REFIT, LEAST_PROMISE, REFIT_TRIES = 1e-2, 1e-3, 12
 FIRST_COUNT = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReducedSettings:
     """Number of the patches and the radii (L0) to choose from, the objective, how long each phase may go on, and the
     factor by which lam_round grows in each step.
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
+    centers : (n_points,) vertices at which points are held first; None spreads them over the body
     """
 
     n_points: int
@@ -61,6 +63,7 @@ class ReducedSettings:
     undecided_fraction: float = 2e-4
     round_growth: float = 1.6
     nearly: float = 1.5
+    centers: IntArray | None = None
 
 
 class Phase(Enum):
@@ -167,13 +170,14 @@ def first_search(problem: Problem, settings: ReducedSettings) -> Search:
         raise EquilibriumError(msg)
     rho = np.full(problem.n_tets, START_DENSITY)
     x = np.where(problem.clamp[:, None], problem.body.X, problem.X_temp)
+    centers = spread_centers(problem, settings.n_points) if settings.centers is None else settings.centers
     needed = 0.0
     for radius in settings.patch_radii:
         if radius < needed and radius != settings.patch_radii[-1]:
             continue
-        equilibria, median = _held_at_target(problem, settings.n_points, radius, rho, x)
-        x, traction = median.x, largest_traction(equilibria.patches, problem, median)
-        if traction <= LARGEST_TRACTION and not len(stretch_excess(problem, settings.weights, rho, x).tets):
+        equilibria, median = _held_at_target(problem, centers, radius, rho, x)
+        traction = largest_traction(equilibria.patches, problem, median)
+        if traction <= LARGEST_TRACTION and not len(stretch_excess(problem, settings.weights, rho, median.x).tets):
             break
         # The forces grow with the pads, so that none smaller than this will do.
         needed = radius * np.sqrt(traction / LARGEST_TRACTION)
@@ -194,23 +198,26 @@ def largest_traction(patches: Patches, problem: Problem, median: Median) -> floa
 
 
 def _held_at_target(
-    problem: Problem, count: int, radius: float, rho: FloatArray, x: FloatArray
+    problem: Problem, centers: IntArray, radius: float, rho: FloatArray, x: FloatArray
 ) -> tuple[Equilibria, Median]:
-    """`count` patches where X_temp has them and the median shape reached from x.
+    """Patches held where X_temp has them and the median shape near x.
 
-    When that fails, four times as many are held first, then those are let go.
+    Where Newton does not find it from there, with four times as many held first; else where loading from the permanent
+    shape ends.
     """
-    equilibria = Equilibria(problem, spread_patches(problem, count, radius))
+    equilibria = Equilibria(problem, build_patches(problem, centers, radius))
     median = _relaxed(equilibria, rho, x)
     if not median.solution.converged:
-        dense = equilibria.with_patches(spread_patches(problem, 4 * count, radius))
+        dense = equilibria.with_patches(spread_patches(problem, 4 * len(centers), radius))
         median = _relaxed(equilibria, rho, _relaxed(dense, rho, x).x)
     if not median.solution.converged:
-        msg = (
-            f"no equilibrium near the temporary shape with {equilibria.patches.count} points held "
-            f"({median.solution.status.value}): allow more points ([goal] max_forces)"
-        )
-        raise EquilibriumError(msg)
+        median, _, loaded = load(equilibria, rho, x, np.zeros((equilibria.patches.count, 3)))
+        if loaded < 1.0 or not median.solution.converged:
+            msg = (
+                f"no equilibrium near the temporary shape with {equilibria.patches.count} points held "
+                f"({median.solution.status.value}): allow more points ([goal] max_forces)"
+            )
+            raise EquilibriumError(msg)
     return equilibria, median
 
 

@@ -37,10 +37,14 @@ def coarse_for(
     if element != "linear" or problem.n_tets <= MANY_TETS:
         return None
     monitor.progress("coarsen")
+    coarse = coarse_of(problem, mesh, materials, COARSE_TETS)
+    return None if coarse.level.coarse.n_tets > MOST_KEPT * problem.n_tets else coarse
+
+
+def coarse_of(problem: Problem, mesh: Mapping[str, np.ndarray], materials: MaterialCard, n_tets: int) -> Coarse:
+    """The mesh coarsened to some `n_tets`, or as few as its walls allow."""
     X, X_temp, clamp = mesh["X"], mesh["X_temp"], mesh["clamp"]
-    found = coarsened(X, X_temp, mesh["tets"], clamp, COARSE_TETS)
-    if len(found.tets) > MOST_KEPT * problem.n_tets:
-        return None
+    found = coarsened(X, X_temp, mesh["tets"], clamp, n_tets)
     kept = found.vertices
     arrays = {"X": X[kept], "X_temp": X_temp[kept], "tets": found.tets, "clamp": clamp[kept]}
     return Coarse(arrays, level_of(problem_of(arrays, materials, "linear"), problem, kept))

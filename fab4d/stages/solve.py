@@ -22,6 +22,7 @@ from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
 from fab4d.stages._repair import repaired
 from fab4d.stages._search import search_arrays, search_from
+from fab4d.stages._starts import Starts
 from fab4d.stages.monitor import Monitor, Prefixed
 
 CHECKPOINT, BEST, POINTS = "iterate", "best", "points"
@@ -212,10 +213,15 @@ def _search(
     before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
     count, finishes = _points(problem, profile, trace, monitor), dict[int, Search | None]()
     enough = profile["goal"].smp == "enough"
+    starts = Starts(
+        problem, mesh, profile["materials"], lambda other: search_settings(other, profile, 0, count), trace, monitor
+    )
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
         watch = _watch(attempt, start, trace, monitor, before_rounding)
-        at = relaxed(problem, settings, watch, start)
+        at = relaxed(problem, replace(settings, centers=starts.chosen()), watch, start)
+        if attempt == 0 and _asked(profile, settings):
+            at = starts.best(at, _watch(attempt, None, trace, monitor, before_rounding))
         if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
             finishes[attempt] = finished = _finished(mesh, profile, element, at, settings, trace)
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
@@ -261,8 +267,12 @@ def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor, b
 
 def _hopeless(profile: Mapping[str, Any], settings: ReducedSettings, found: Search) -> bool:
     """Whether other attempts, which make rounding cost less, cannot help: the relaxed design misses the tolerance."""
-    asked = profile["goal"].max_forces is not None or settings.n_points == profile["rig"].max_points
-    return asked and _reached(found) > settings.weights.error_scale
+    return _asked(profile, settings) and _reached(found) > settings.weights.error_scale
+
+
+def _asked(profile: Mapping[str, Any], settings: ReducedSettings) -> bool:
+    """Whether there cannot be more points."""
+    return profile["goal"].max_forces is not None or settings.n_points == profile["rig"].max_points
 
 
 def _reached(found: Search) -> float:

@@ -1,4 +1,4 @@
-"""Stage `verify`: the finished design simulated from the permanent shape; its end state is what is delivered."""
+"""Stage `verify`: the finished design as simulated from the permanent shape; its end state is what is delivered."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.forward import Programming, balance, program, same_shape
+from fab4d.design.forward import Programming, balance, program, programmed_to, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.problem import Problem
 from fab4d.mesh.distance import shape_error
@@ -21,14 +21,25 @@ NO_FORCES: dict[str, Any] = {"force_change": None, "force_uncertainty": None, "l
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
-    """Load step by step from the permanent shape, cool, unload; measure what comes out."""
-    mesh, printed, materials = inputs["mesh"], inputs["printed"], profile["materials"]
+    """Load step by step from the permanent shape, cool, unload; measure what comes out.
+
+    A loading that the stage before has followed to this design is not followed again: its end is solved and measured.
+    """
+    mesh, printed, loaded, materials = inputs["mesh"], inputs["printed"], inputs["loaded"], profile["materials"]
     smp = inputs["labels"]["smp"].astype(np.float64)
     problem = problem_like(mesh, materials, printed["x"])
     equilibria = Equilibria(problem, patches_of(problem, printed))
     monitor.progress("load")
     x = printed["x"] / problem.length
-    done = program(equilibria, smp, x, printed["patch_force"] / problem.force)
+    if loaded is None:
+        done = program(equilibria, smp, x, printed["patch_force"] / problem.force)
+    else:
+        at, forces, y = (
+            loaded["x"] / problem.length,
+            loaded["patch_force"] / problem.force,
+            loaded["y"] / problem.length,
+        )
+        done = programmed_to(equilibria, smp, at, forces, y, int(loaded["load_steps"]))
     residual = balance(equilibria, smp, done.median, done.final)
     y = done.final.y * problem.length
     n = len(mesh["X"])

@@ -11,7 +11,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
-from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces
+from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces, spread_centers
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import (
     Phase,
@@ -31,7 +31,9 @@ from fab4d.design.reduced import (
     solve_reduced,
     undecided_fraction,
 )
+from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.solvers.newton import Solution, Status
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3, lam_SMP=0.05, lam_smooth=0.3)
 
@@ -101,6 +103,25 @@ def test_the_solved_scene_is_reached_from_the_permanent_shape(truth: Truth, sear
     assert (done.loaded, done.unloaded) == (1.0, 1.0)
     assert balance(found.equilibria, design.rho, done.median, done.final).final < 1e-9
     assert shape_error(truth.problem, done.final.y).rms < 3e-3
+
+
+def test_points_begin_where_they_are_asked_for(truth: Truth) -> None:
+    centers = spread_centers(truth.problem, 7)[3:]
+    found = first_search(truth.problem, settings_for(truth.problem, centers=centers))
+    np.testing.assert_array_equal(found.equilibria.patches.centers, centers)
+
+
+def test_loading_finds_the_first_shape_where_newton_does_not(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is the same one, here where both do."""
+    expected = first_search(truth.problem, settings_for(truth.problem)).design.median.x
+    lost = Solution(np.zeros(0), Status.NO_STEP, 1.0, 0, 0)
+    direct = reduced._relaxed
+    monkeypatch.setattr(reduced, "_relaxed", lambda *given: replace(direct(*given), solution=lost))
+    found = first_search(truth.problem, settings_for(truth.problem)).design.median.x
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    monkeypatch.setattr(reduced, "load", lambda equilibria, rho, x, f: (direct(equilibria, rho, x), 1, 0.5))  # noqa: ARG005
+    with pytest.raises(EquilibriumError, match="no equilibrium near the temporary shape with 4 points"):
+        first_search(truth.problem, settings_for(truth.problem))
 
 
 def test_larger_patches_are_taken_where_small_ones_stretch_too_far(truth: Truth) -> None:

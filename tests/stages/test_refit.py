@@ -83,6 +83,23 @@ def test_loading_ends_in_the_fitted_state(inputs: Artifacts, fitted: tuple[str, 
     np.testing.assert_allclose(y @ R.T + t, printed["y"], atol=1e-6)
 
 
+def test_the_end_of_the_loading_is_handed_on(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
+    found = fitted[1]
+    loaded, printed = found["loaded"], found["printed"]
+    np.testing.assert_allclose(loaded["x"], printed["x"], atol=1e-5 * np.ptp(inputs["mesh"]["X"]))
+    np.testing.assert_allclose(loaded["patch_force"], printed["patch_force"], rtol=1e-3)
+    assert loaded["load_steps"] > 2
+
+
+def test_no_loading_is_handed_on_that_does_not_reach_the_design(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
+    found = refit.run(inputs, PROFILE, SilentMonitor())
+    assert found["loaded"] is None
+    assert found["refit_report"]["fits"] == refit.MOST_FITS
+
+
 def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
     mesh, smp = inputs["mesh"], fitted[1]["labels"]["smp"]
     again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), np.ones(len(smp)), PROFILE["printer"])
@@ -104,13 +121,17 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
 
 
 @pytest.mark.parametrize(
-    ("relaxed_rms", "down_to"),
+    ("relaxed_rms", "n_tets", "down_to"),
     [
-        (0.5, 0.575),  # far below the tolerance: the share above the relaxed error
-        (0.95, 1.0),  # the tolerance comes first
-        (1.1, 1.0),  # flips may win what the relaxed design lacks
-        (1.2, 1.38),  # out of reach: no more work than that of rounding
+        (0.3, 60_000, 0.345),  # far below the tolerance: the share above the relaxed error
+        (0.3, 60_001, 0.5),  # the same on a large mesh: what is good enough
+        (0.5, 60_001, 0.575),
+        (0.95, 1_000, 1.0),  # the tolerance comes first
+        (1.1, 60_001, 1.0),  # flips may win what the relaxed design lacks
+        (1.2, 1_000, 1.38),  # out of reach: no more work than that of rounding
     ],
 )
-def test_labels_are_flipped_until_the_tolerance_is_met_where_it_is_near(relaxed_rms: float, down_to: float) -> None:
-    assert refit.flipped_down_to(relaxed_rms, 1.0) == pytest.approx(down_to)
+def test_labels_are_flipped_until_the_tolerance_is_met_where_it_is_near(
+    relaxed_rms: float, n_tets: int, down_to: float
+) -> None:
+    assert refit.flipped_down_to(relaxed_rms, 1.0, n_tets) == pytest.approx(down_to)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import Design
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.io.cards import load_material
 from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.stages import verify
 from fab4d.stages._design import patch_arrays, patches_of, problem_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.verify import run
@@ -53,9 +54,11 @@ def printed(scene: Arrays, labels: Arrays) -> Arrays:
     return shapes | patch_arrays(problem, patches, Design(rho, median, final))
 
 
-def verified(scene: Arrays, labels: Arrays, printed: Arrays, card: Any = CARD) -> tuple[Arrays, dict[str, Any]]:
+def verified(
+    scene: Arrays, labels: Arrays, printed: Arrays, card: Any = CARD, loaded: Arrays | None = None
+) -> tuple[Arrays, dict[str, Any]]:
     result = run(
-        {"mesh": scene, "labels": labels, "printed": printed},
+        {"mesh": scene, "labels": labels, "printed": printed, "loaded": loaded},
         {"materials": card},
         SilentMonitor(),
     )
@@ -70,6 +73,33 @@ def test_a_design_is_reached_and_its_state_told(scene: Arrays, labels: Arrays, p
     np.testing.assert_allclose(state["x"], printed["x"], atol=1e-7)
     np.testing.assert_allclose(state["patch_force"], printed["patch_force"], rtol=1e-6)
     np.testing.assert_array_equal(state["x"][state["clamp"]], scene["X"][scene["clamp"]])
+
+
+def test_a_loading_that_was_followed_before_is_not_followed_again(
+    scene: Arrays, labels: Arrays, printed: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its end, known to four digits, is solved to rounding and measured as if it had been."""
+    state, report = verified(scene, labels, printed)
+    off = 1e-4 * np.sin(scene["X"]) * ~scene["clamp"][:, None]
+    loaded = {"x": state["x"] + off, "y": state["y"] + off, "patch_force": state["patch_force"]}
+    loaded["load_steps"] = np.array(report["load_steps"])
+    loaded["patch_force"] = held_force(scene, printed, loaded["x"])
+    monkeypatch.setattr(verify, "program", None)
+    again, same = verified(scene, labels, printed, loaded=loaded)
+    for name in ("x", "patch_force"):
+        np.testing.assert_allclose(again[name], state[name], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(again["y"], best_fit(again["y"], state["y"]), atol=1e-8)
+    assert same["load_steps"] == report["load_steps"]
+    assert same["error"]["rms"] == pytest.approx(report["error"]["rms"], rel=1e-8)
+    assert max(same["equilibrium_residual"].values()) < 1e-10
+
+
+def held_force(scene: Arrays, printed: Arrays, x: np.ndarray) -> np.ndarray:
+    """(K, 3) the forces, N, that go with the shape x (mm) where the points are held as in `printed`."""
+    problem = problem_of(scene, CARD, "linear")
+    patches = patches_of(problem, printed)
+    moved = (patches.mean(printed["x"]) - patches.mean(x)) / problem.length
+    return printed["patch_force"] + moved / RIG_COMPLIANCE * problem.force
 
 
 def test_a_quadratic_fit_is_verified_in_quadratic_elements(scene: Arrays, labels: Arrays, printed: Arrays) -> None:

@@ -1,0 +1,100 @@
+"""Other points for the search to begin with, where those spread over the body nearly meet the tolerance."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fab4d.design.problem import Problem
+from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, relaxed
+from fab4d.design.starts import beginnings
+from fab4d.materials.cards import MaterialCard
+from fab4d.mesh.tetmesh import IntArray
+from fab4d.stages._coarse import coarse_of
+from fab4d.stages._design import Trace
+from fab4d.stages._search import search_arrays, search_from
+from fab4d.stages.monitor import Monitor
+
+FIRST, CENTERS = "first", "centers"
+# Other points may win some 10 %: they are not tried where the tolerance is missed by more than this factor.
+NEARLY = 1.5
+# Larger meshes are coarsened for it: there each beginning takes seconds, and what is better on them is so on all.
+LARGE_TETS, START_TETS = 12_000, 6_000
+# Another beginning is taken where it leads to an error below the first share of the usual one's. An error below the
+# second share of the tolerance ends the search.
+BETTER, WELL_BELOW = 0.97, 0.85
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """What the search for other points needs; settings_of : of the solver, for a problem."""
+
+    problem: Problem
+    mesh: Mapping[str, np.ndarray]
+    materials: MaterialCard
+    settings_of: Callable[[Problem], ReducedSettings]
+    trace: Trace
+    monitor: Monitor
+
+    def chosen(self) -> IntArray | None:
+        """The centers (K,) that were found to be better than those of the settings, or None."""
+        saved = self.monitor.restore(CENTERS)
+        return saved[CENTERS] if saved is not None and len(saved[CENTERS]) else None
+
+    def best(self, at: Search, watch: Watch) -> Search:
+        """The better one of the relaxed design `at` and that from other points, if it is worth looking for those.
+
+        at : may be the one from other points already, where an interrupted run goes on
+        """
+        settings = self.settings_of(self.problem)
+        limit = settings.weights.error_scale
+        if at.phase is not Phase.ROUND or at.iteration or not limit < at.relaxed_rms <= NEARLY * limit:
+            return at
+        saved = self.monitor.restore(FIRST)
+        if saved is None:
+            self.monitor.save(FIRST, search_arrays(at))
+        first = at if saved is None else search_from(self.problem, saved)
+        if not np.array_equal(at.design.rho, first.design.rho):
+            return self._lower(first, at, watch)
+        if self.monitor.restore(CENTERS) is None:
+            self._keep(self._search(first.relaxed_rms))
+        centers = self.chosen()
+        if centers is None:
+            return first
+        other = relaxed(self.problem, replace(settings, centers=centers), watch)
+        return self._lower(first, other, watch)
+
+    def _lower(self, first: Search, other: Search, watch: Watch) -> Search:
+        if other.relaxed_rms < first.relaxed_rms:
+            return other
+        self._keep(np.zeros(0, np.int64))
+        # Shown again, without a row of its own: it is what the rest sets out from.
+        watch(replace(first, accepted=False))
+        return first
+
+    def _keep(self, centers: IntArray) -> None:
+        self.monitor.save(CENTERS, {CENTERS: centers})
+
+    def _search(self, usual: float) -> IntArray:
+        """Centers (K,) from which relaxing comes lower than from the usual ones, which is to `usual`; or none."""
+        problem, told, vertices = self.problem, self.trace, np.arange(len(self.mesh["X"]))
+        large = problem.n_tets > LARGE_TETS
+        if large:
+            coarse = coarse_of(problem, self.mesh, self.materials, START_TETS)
+            problem, vertices = coarse.level.coarse, coarse.level.vertices
+            told = told.on(problem, coarse.mesh)
+        # Steps past unstable states are for the one that is taken.
+        settings = replace(self.settings_of(problem), nearly=1.0)
+
+        def watch(at: Search) -> None:
+            told.add("other points", at)
+
+        found, least = np.zeros(0, np.int64), BETTER * usual
+        if large:
+            least = BETTER * relaxed(problem, settings, watch).relaxed_rms
+        for at in beginnings(problem, settings, watch):
+            if at.relaxed_rms < least:
+                found, least = vertices[at.equilibria.patches.centers], at.relaxed_rms
+            if least <= WELL_BELOW * settings.weights.error_scale:
+                break
+        return found
