@@ -59,7 +59,13 @@ def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, wat
     start = carried_over(equilibria, design.rho, design.median.x, design.final.y, design.median.forces)
     if start is None:
         return None
-    at = Search(equilibria, start, relaxed.patch_radius, lam_SMP=relaxed.lam_SMP, exchanges=EXCHANGED)
+    return rounded_from(replace(relaxed, equilibria=equilibria, design=start), settings, watch)
+
+
+def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
+    """A near 0/1 design from a relaxed one that was carried over from another discretisation: as `rounded_in`."""
+    problem = carried.equilibria.problem
+    at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
     settings = replace(settings, relax_iterations=RELAX_ITERATIONS, round_growth=ROUND_GROWTH)
     L, held_back = smoothness_matrix(problem), 0

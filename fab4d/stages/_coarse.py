@@ -15,6 +15,8 @@ from fab4d.stages.monitor import Monitor
 # Meshes of more tets are searched on a coarser one of so many: steps on them take minutes, and hardly lead anywhere
 # where squeezed surfaces turn unstable in waves that coarse meshes are too stiff for.
 MANY_TETS, COARSE_TETS = 60_000, 20_000
+# The relaxed design is rounded on all tets, or where they are more than the first number, on a mesh of the second.
+MOST_ROUNDED, ROUNDED_TETS = 100_000, 55_000
 # Coarser meshes that keep more than this share of the tets, for thin walls, gain nothing.
 MOST_KEPT = 0.6
 
@@ -29,16 +31,19 @@ class Coarse:
 
 def coarse_for(
     problem: Problem, mesh: Mapping[str, np.ndarray], materials: MaterialCard, element: str, monitor: Monitor
-) -> Coarse | None:
-    """The coarse mesh for the search on `problem`, of linear elements; None where the search is on the mesh itself.
+) -> list[Coarse]:
+    """Coarse meshes of linear elements, each of the one before it; empty where the search is on the mesh itself.
 
-    element : of the last fit
+    The search is on the last one, and its relaxed design is rounded on the one before. element : of the last fit
     """
     if element != "linear" or problem.n_tets <= MANY_TETS:
-        return None
+        return []
     monitor.progress("coarsen")
-    coarse = coarse_of(problem, mesh, materials, COARSE_TETS)
-    return None if coarse.level.coarse.n_tets > MOST_KEPT * problem.n_tets else coarse
+    chain, finer = list[Coarse](), (problem, mesh)
+    for n_tets in [ROUNDED_TETS] * (problem.n_tets > MOST_ROUNDED) + [COARSE_TETS]:
+        chain.append(coarse_of(*finer, materials, n_tets))
+        finer = (chain[-1].level.coarse, chain[-1].mesh)
+    return [] if chain[-1].level.coarse.n_tets > MOST_KEPT * problem.n_tets else chain
 
 
 def coarse_of(problem: Problem, mesh: Mapping[str, np.ndarray], materials: MaterialCard, n_tets: int) -> Coarse:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import rounded_in
-from fab4d.design.levels import carried_up
+from fab4d.design.finish import rounded_from, rounded_in
+from fab4d.design.levels import Level, carried_up
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
@@ -65,10 +65,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     if inputs["picked"] is not None:
         return _picked(problem, inputs, profile, trace, tau_s)
     element, _ = element_for(mesh, profile["solver"].element)
-    found, report = (
-        _designed_coarse(problem, mesh, profile, element, trace, monitor)
-        or _designed(problem, mesh, profile, element, trace, monitor)
-    )  # fmt: skip
+    designed = _designed_coarse(problem, mesh, profile, element, trace, monitor)
+    if designed is None:
+        found, _, report = _designed(problem, mesh, profile, element, trace, monitor)
+    else:
+        found, report = designed
     return _artifacts(mesh, profile, found, trace, {"tau_s": tau_s, "iterations": len(trace.rows)} | report)
 
 
@@ -79,15 +80,18 @@ def _designed(
     element: str,
     trace: Trace,
     monitor: Monitor,
-) -> tuple[Search, dict[str, Any]]:
-    """The design of all attempts, with the least SMP if the goal asks for that, and what the report says of it."""
+) -> tuple[Search, Search, dict[str, Any]]:
+    """The design of all attempts, with the least SMP if the goal asks for that, it before rounding, and what the report
+    says of it."""
     searched = _search(problem, mesh, profile, element, trace, monitor)
     least = None
     if profile["goal"].smp == "least":
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
         least = least_smp(problem, mesh, sections, searched.settings, searched.found, trace, monitor)
         finished = _finished(mesh, profile, element, least.relaxed, searched.settings, trace)
-        searched = replace(searched, found=least.found, printed_rms=least.printed_rms, finished=finished)
+        searched = replace(
+            searched, found=least.found, relaxed=least.relaxed, printed_rms=least.printed_rms, finished=finished
+        )
     rms = searched.printed_rms
     report = {
         "attempts": searched.attempts,
@@ -96,7 +100,7 @@ def _designed(
         "limited_by": _limited_by(problem, profile, searched.found),
         "left_out": LEFT_OUT + searched.left_out,
     }
-    return searched.finished or searched.found, report
+    return searched.finished or searched.found, searched.relaxed, report
 
 
 def _designed_coarse(
@@ -112,22 +116,49 @@ def _designed_coarse(
     None where the mesh is small, or where the coarser one or the way back finds no equilibrium: the whole mesh is then
     searched, which takes longer.
     """
-    coarse = coarse_for(problem, mesh, profile["materials"], element, monitor)
-    if coarse is None:
+    chain = coarse_for(problem, mesh, profile["materials"], element, monitor)
+    if not chain:
         return None
-    level = coarse.level
-    own = trace.on(level.coarse, coarse.mesh)
+    coarse, mesh_of = chain[-1], [mesh, *(coarse.mesh for coarse in chain)]
+    own = trace.on(coarse.level.coarse, coarse.mesh)
     try:
-        found, report = _designed(level.coarse, coarse.mesh, profile, "linear", own, Prefixed(monitor, "coarse-"))
+        found, before, report = _designed(
+            coarse.level.coarse, coarse.mesh, profile, "linear", own, Prefixed(monitor, "coarse-")
+        )
     except EquilibriumError:
         return None
-    carried = carried_up(level, found)
+    finer = trace.on(coarse.level.fine, mesh_of[-2])
+    carried = _rounded_up(coarse.level, before, profile, report["attempts"] - 1, finer)
+    if carried is None:
+        carried = carried_up(coarse.level, found)
+    for finer_level in [other.level for other in chain[-2::-1]]:
+        carried = None if carried is None else carried_up(finer_level, carried)
     if carried is None:
         return None
     trace.add("carried over", carried)
-    why = f"the design is found on {level.coarse.n_tets} tets of the same part and carried over"
+    why = f"the design is found on {coarse.level.coarse.n_tets} tets of the same part and carried over"
     left_out = [*report["left_out"], {"what": f"search on all {problem.n_tets} tets", "why": why}]
     return carried, report | {"left_out": left_out}
+
+
+def _rounded_up(level: Level, before: Search, profile: Mapping[str, Any], attempt: int, trace: Trace) -> Search | None:
+    """The coarse design as it was before rounding, rounded on the finer mesh, whose equilibria are others.
+
+    None where it is not relaxed, finds no equilibrium there or on the way, or needs more SMP than the goal allows.
+    """
+    carried = carried_up(level, before) if before.phase is Phase.ROUND else None
+    if carried is None:
+        return None
+    settings = search_settings(level.fine, profile, attempt)
+    finished = rounded_from(carried, replace(settings, nearly=1.0), trace.add)
+    return finished if _affordable(finished, profile["goal"]) else None
+
+
+def _affordable(finished: Search | None, goal: Goal) -> bool:
+    """Whether there is a design, and it keeps to the goal's share of SMP."""
+    if finished is None or goal.max_smp_fraction is None:
+        return finished is not None
+    return bool(finished.equilibria.problem.volume_fractions @ finished.design.rho <= goal.max_smp_fraction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +166,13 @@ class _Searched:
     """What the attempts came to.
 
     found : the best design, rounded in linear elements, or else still relaxed        settings : of the last attempt
+    relaxed : the last design before rounding
     printed_rms : RMS error of `found` as printed, L0, inf where it was not judged
     finished : the last relaxed design, rounded in the elements of the last fit
     """
 
     found: Search
+    relaxed: Search
     settings: ReducedSettings
     attempts: int
     printed_rms: float
@@ -163,10 +196,8 @@ def _finished(
     if element == "linear" or relaxed.phase is not Phase.ROUND or _far_off(relaxed, settings):
         return None
     problem = problem_of(mesh, profile["materials"], element)
-    finished, most = rounded_in(problem, relaxed, settings, trace.add), profile["goal"].max_smp_fraction
-    if finished is not None and most is not None and problem.volume_fractions @ finished.design.rho > most:
-        return None
-    return finished
+    finished = rounded_in(problem, relaxed, settings, trace.add)
+    return finished if _affordable(finished, profile["goal"]) else None
 
 
 def _far_off(relaxed: Search, settings: ReducedSettings) -> bool:
@@ -225,7 +256,7 @@ def _search(
         if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
             finishes[attempt] = finished = _finished(mesh, profile, element, at, settings, trace)
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
-                return _Searched(at, settings, 1, np.inf, finished, [NOT_LINEAR])
+                return _Searched(at, at, settings, 1, np.inf, finished, [NOT_LINEAR])
         found = solve_reduced(problem, settings, watch, at)
         if _hopeless(profile, settings, found):
             best = best or found
@@ -242,7 +273,7 @@ def _search(
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
     left_out = [NOT_QUADRATIC] if element == "quadratic" and _far_off(last, settings) else []
-    return _Searched(best, settings, attempt + 1, least, finishes.get(attempt), left_out)
+    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt), left_out)
 
 
 def _rms(found: Search) -> float:

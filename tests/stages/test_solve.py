@@ -103,7 +103,7 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
     assert usual.nearly > fast.nearly == 1.0
-    assert replace(fast, round_growth=usual.round_growth, nearly=usual.nearly) == usual
+    assert vars(replace(fast, round_growth=usual.round_growth, nearly=usual.nearly)) == vars(usual)
 
 
 def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
@@ -176,6 +176,56 @@ def test_many_tets_are_searched_on_a_coarser_mesh(fine_bar: dict[str, np.ndarray
     assert shape_error(problem, relaxed["y"] / problem.length).rms * problem.length < 1.5
 
 
+def carried_phases(found: dict[str, Any]) -> list[str]:
+    """Phases of the trace from the first design that was carried over on."""
+    rows = [row.split(b",")[1].decode() for row in found["solve_trace"].splitlines()]
+    return rows[rows.index("carried over") :]
+
+
+@pytest.mark.usefixtures("few")
+def test_the_design_is_rounded_where_tets_are_small(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On all tets, or on a mesh between if they are too many; where that comes to nothing the coarse labels serve."""
+    goal = Goal(tolerance=0.6, max_forces=4)
+    errors = {}
+    whole = solved(fine_bar, goal)
+    assert carried_phases(whole)[:2] == ["carried over", "relax"]
+    assert "round" in carried_phases(whole)
+    errors["all"] = off_by(fine_bar, whole)
+    monkeypatch.setattr(_coarse, "MOST_ROUNDED", 1_000)
+    monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
+    between = solved(fine_bar, goal)
+    assert carried_phases(between).count("carried over") == 2
+    assert carried_phases(between)[-1] == "carried over"
+    assert between["relaxed"]["rho"].shape == (len(fine_bar["tets"]),)
+    monkeypatch.setattr(_coarse, "MOST_ROUNDED", 10**6)
+    monkeypatch.setattr(solve, "rounded_from", lambda *_: None)
+    coarse = solved(fine_bar, goal)
+    assert carried_phases(coarse) == ["carried over"]
+    errors["coarse"] = off_by(fine_bar, coarse)
+    assert errors["all"] < errors["coarse"]
+
+
+@pytest.mark.usefixtures("few")
+def test_a_design_that_needs_too_much_smp_when_rounded_again_is_not_taken(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def all_smp(carried: Search, settings: Any, watch: Any) -> Search:  # noqa: ARG001
+        return replace(carried, design=replace(carried.design, rho=np.ones(len(carried.design.rho))))
+
+    monkeypatch.setattr(solve, "rounded_from", all_smp)
+    assert solved(fine_bar, Goal(tolerance=0.6, max_forces=4))["relaxed"]["rho"].min() == 1.0
+    limited = solved(fine_bar, Goal(tolerance=0.6, max_forces=4, max_smp_fraction=0.9))
+    assert limited["relaxed"]["rho"].min() < 0.5
+
+
+def off_by(mesh: dict[str, np.ndarray], found: dict[str, Any]) -> float:
+    """RMS error, mm, of the design."""
+    problem = problem_of(mesh, PROFILE["materials"], "linear")
+    return shape_error(problem, found["relaxed"]["y"] / problem.length).rms * problem.length
+
+
 @pytest.mark.usefixtures("few")
 def test_a_design_that_is_lost_on_the_whole_mesh_is_searched_there(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
@@ -189,8 +239,8 @@ def test_a_design_that_is_lost_on_the_whole_mesh_is_searched_there(
 @pytest.mark.usefixtures("few")
 def test_quadratic_elements_keep_to_their_mesh(fine_bar: dict[str, np.ndarray]) -> None:
     problem = problem_of(fine_bar, PROFILE["materials"], "linear")
-    assert _coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "quadratic", SilentMonitor()) is None
-    assert _coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "linear", SilentMonitor()) is not None
+    assert _coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "quadratic", SilentMonitor()) == []
+    assert len(_coarse.coarse_for(problem, fine_bar, PROFILE["materials"], "linear", SilentMonitor())) == 1
 
 
 def test_a_plate_too_thin_to_coarsen_is_searched_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +249,7 @@ def test_a_plate_too_thin_to_coarsen_is_searched_whole(monkeypatch: pytest.Monke
     monkeypatch.setattr(_coarse, "MANY_TETS", 100)
     monkeypatch.setattr(_coarse, "COARSE_TETS", 400)
     problem = problem_of(plate, PROFILE["materials"], "linear")
-    assert _coarse.coarse_for(problem, plate, PROFILE["materials"], "linear", SilentMonitor()) is None
+    assert _coarse.coarse_for(problem, plate, PROFILE["materials"], "linear", SilentMonitor()) == []
 
 
 @pytest.mark.usefixtures("few")
