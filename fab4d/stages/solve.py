@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -119,7 +119,7 @@ def _designed_coarse(
     chain = coarse_for(problem, mesh, profile["materials"], element, monitor)
     if not chain:
         return None
-    coarse, mesh_of = chain[-1], [mesh, *(coarse.mesh for coarse in chain)]
+    coarse, finer_mesh = chain[-1], chain[-2].mesh if len(chain) > 1 else mesh
     own = trace.on(coarse.level.coarse, coarse.mesh)
     try:
         found, before, report = _designed(
@@ -127,18 +127,24 @@ def _designed_coarse(
         )
     except EquilibriumError:
         return None
-    finer = trace.on(coarse.level.fine, mesh_of[-2])
-    carried = _rounded_up(coarse.level, before, profile, report["attempts"] - 1, finer)
-    if carried is None:
-        carried = carried_up(coarse.level, found)
-    for finer_level in [other.level for other in chain[-2::-1]]:
-        carried = None if carried is None else carried_up(finer_level, carried)
+    levels = [each.level for each in reversed(chain)]
+    finer = trace.on(coarse.level.fine, finer_mesh)
+    rounded = _rounded_up(levels[0], before, profile, report["attempts"] - 1, finer)
+    at, left = (found, levels) if rounded is None else (rounded, levels[1:])
+    carried = _carried_up_all(left, at)
     if carried is None:
         return None
-    trace.add("carried over", carried)
+    if left:
+        trace.add("carried over", carried)
     why = f"the design is found on {coarse.level.coarse.n_tets} tets of the same part and carried over"
     left_out = [*report["left_out"], {"what": f"search on all {problem.n_tets} tets", "why": why}]
     return carried, report | {"left_out": left_out}
+
+
+def _carried_up_all(levels: Sequence[Level], at: Search | None) -> Search | None:
+    for level in levels:
+        at = None if at is None else carried_up(level, at)
+    return at
 
 
 def _rounded_up(level: Level, before: Search, profile: Mapping[str, Any], attempt: int, trace: Trace) -> Search | None:
