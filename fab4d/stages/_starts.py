@@ -8,6 +8,7 @@ import numpy as np
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, relaxed
 from fab4d.design.starts import beginnings
+from fab4d.errors import EquilibriumError
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.tetmesh import IntArray
 from fab4d.stages._coarse import coarse_of
@@ -19,6 +20,7 @@ FIRST, CENTERS = "first", "centers"
 # Other points may win some 10 %: they are not tried where the tolerance is missed by more than this factor.
 NEARLY = 1.5
 # Larger meshes are coarsened for it: there each beginning takes seconds, and what is better on them is so on all.
+# Nothing is compared where thin walls keep more tets than that, or the usual points have no equilibrium there.
 LARGE_TETS, START_TETS = 12_000, 6_000
 # Another beginning is taken where it leads to an error below the first share of the usual one's. An error below the
 # second share of the tolerance ends the search.
@@ -78,20 +80,26 @@ class Starts:
     def _search(self, usual: float) -> IntArray:
         """Centers (K,) from which relaxing comes lower than from the usual ones, which is to `usual`; or none."""
         problem, told, vertices = self.problem, self.trace, np.arange(len(self.mesh["X"]))
+        none = np.zeros(0, np.int64)
         large = problem.n_tets > LARGE_TETS
         if large:
             coarse = coarse_of(problem, self.mesh, self.materials, START_TETS)
             problem, vertices = coarse.level.coarse, coarse.level.vertices
             told = told.on(problem, coarse.mesh)
+        if problem.n_tets > LARGE_TETS:
+            return none
         # Steps past unstable states are for the one that is taken.
         settings = replace(self.settings_of(problem), nearly=1.0)
 
         def watch(at: Search) -> None:
             told.add("other points", at)
 
-        found, least = np.zeros(0, np.int64), BETTER * usual
         if large:
-            least = BETTER * relaxed(problem, settings, watch).relaxed_rms
+            try:
+                usual = relaxed(problem, settings, watch).relaxed_rms
+            except EquilibriumError:
+                return none
+        found, least = none, BETTER * usual
         for at in beginnings(problem, settings, watch):
             if at.relaxed_rms < least:
                 found, least = vertices[at.equilibria.patches.centers], at.relaxed_rms

@@ -15,6 +15,7 @@ from fab4d.design.patches import build_patches, pad_vertices
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import ReducedSettings, Search, relaxed
 from fab4d.design.starts import random_centers
+from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal
 from fab4d.stages import _starts
 from fab4d.stages._design import Trace, problem_of
@@ -135,6 +136,27 @@ def test_on_a_coarser_mesh_the_points_are_vertices_of_the_whole_one(
     mine = Starts(problem, mesh, PROFILE["materials"], settings_of(0.3), trace, Keeping())
     (found,) = mine._search(0.5 / problem.length)
     np.testing.assert_allclose(mesh["X"][found], own.body.X[vertex] * own.length, atol=1e-12)
+
+
+@pytest.mark.parametrize("why", ["no equilibrium", "thin walls"])
+def test_the_usual_points_are_kept_where_a_coarser_mesh_tells_nothing(
+    why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = bent_bar((24, 5, 4), 60.0)
+    problem = problem_of(mesh, PROFILE["materials"], "linear")
+    monkeypatch.setattr(_starts, "LARGE_TETS", 1_000)
+    monkeypatch.setattr(_starts, "START_TETS", 500 if why == "no equilibrium" else problem.n_tets)
+
+    def lost(*_: Any) -> Search:
+        raise EquilibriumError(why)
+
+    looked = list[int]()
+    monkeypatch.setattr(_starts, "relaxed", lost)
+    monkeypatch.setattr(_starts, "beginnings", lambda *_: looked.append(1) or [])
+    trace = Trace(problem, mesh, SilentMonitor(), 1.0)
+    mine = Starts(problem, mesh, PROFILE["materials"], settings_of(0.3), trace, Keeping())
+    assert len(mine._search(0.5 / problem.length)) == 0
+    assert not looked
 
 
 def test_the_error_is_that_of_the_better_points(reached: float) -> None:
