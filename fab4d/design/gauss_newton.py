@@ -57,6 +57,8 @@ def equilibrate(
 TRIAL_ITERATIONS = 8
 # The way past unstable states is longer.
 ASTRAY_ITERATIONS = 20
+# The equilibria of a step are sought from where it is predicted to lead, or from the first of these shares of the way.
+SHARES_OF_CHANGE = (1.0, 0.5, 0.25, 0.125)
 # A step that is predicted to move a node farther than this, in L0, is not tried.
 LARGEST_MOVE = 0.1
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
@@ -289,9 +291,27 @@ def _trial(
         return None
     median, y = design.median, design.final.y
     rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
-    x0, y0 = equilibria.held_turning.step(median.x, dx), equilibria.free_turning.step(y, dy)
+    x0 = _ahead(equilibria.held_turning.step, median.x, dx, lambda x: equilibria.median_gradient(rho, x)[1])
+    y0 = _ahead(equilibria.free_turning.step, y, dy, lambda y: equilibria.final_gradient(rho, median, y)[1])
     most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
     return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=most, stay=stay)
+
+
+def _ahead(
+    step: Callable[[FloatArray, FloatArray], FloatArray],
+    shape: FloatArray,
+    change: FloatArray,
+    energy: Callable[[FloatArray], float],
+) -> FloatArray:
+    """The shape (N, 3) after the predicted change, or after as much of it as turns no tet over.
+
+    A single soft node may be predicted to move far through its tets, where the equilibrium is near all the same.
+    """
+    for share in SHARES_OF_CHANGE:
+        ahead = step(shape, share * change)
+        if np.isfinite(energy(ahead)):
+            return ahead
+    return shape
 
 
 def held_positions(equilibria: Equilibria, median: Median) -> FloatArray:

@@ -31,7 +31,9 @@ from fab4d.design.reduced import (
     solve_reduced,
     undecided_fraction,
 )
+from fab4d.design.sensitivity import Linearisation
 from fab4d.errors import EquilibriumError
+from fab4d.mesh.measures import deformation_gradients
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.solvers.newton import Solution, Status
 
@@ -216,7 +218,7 @@ def test_a_step_may_lead_past_unstable_states(monkeypatch: pytest.MonkeyPatch, s
     straight = held_design(equilibria, rho, X)
     L = smoothness_matrix(problem)
     model = gauss_newton.build_model(equilibria, WEIGHTS, L, straight)
-    monkeypatch.setattr(gauss_newton, "LARGEST_MOVE", 1.0)
+    monkeypatch.setattr(gauss_newton, "LARGEST_MOVE", 10.0)
     found = gauss_newton._trial(
         equilibria, model, straight, np.zeros(problem.n_tets), np.array([[-0.2, 0.0, 0.0]]), stay
     )
@@ -376,6 +378,29 @@ def test_no_step_gains_more_than_it_promises(truth: Truth, damping: float) -> No
     never = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 2.5 * share)
     assert again.accepted
     assert not never.accepted
+
+
+def test_a_step_is_taken_though_it_is_predicted_to_turn_tets_over(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One soft node is predicted to move through its tets, in both shapes, where the equilibria are near."""
+    equilibria, design = truth.equilibria, truth.design
+    soft, predicted, asked = corner(truth.problem, (0.6, 0.5, 1.0)), Linearisation.forward, []
+
+    def through_its_tets(lin: Linearisation, drho: np.ndarray, dc: np.ndarray) -> tuple[np.ndarray, ...]:
+        dx, df, dy = predicted(lin, drho, dc)
+        dx[soft, 2] -= 2.0
+        dy[soft, 2] -= 2.0
+        body = truth.problem.body
+        asked.append(deformation_gradients(body.X, design.final.y + dy, body.elements))
+        return dx, df, dy
+
+    monkeypatch.setattr(Linearisation, "forward", through_its_tets)
+    monkeypatch.setattr(gauss_newton, "LARGEST_MOVE", 10.0)
+    weights = WEIGHTS.replace(error_scale=0.1)
+    step = gauss_newton.gauss_newton_step(equilibria, weights, smoothness_matrix(truth.problem), design, 1.0, tries=1)
+    assert np.linalg.det(asked[0]).min() < 0
+    assert step.accepted
 
 
 def test_fewer_smp_is_used_when_the_goal_says_so(truth: Truth, searched: list[Search]) -> None:
