@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import smoothness_matrix
@@ -44,7 +46,9 @@ def carried_over(
     median = equilibria.solve_median(rho, held, x, forces, SEARCH_TOLERANCE, 100)
     if not median.solution.converged:
         return None
-    y = equilibria.free_turning.repeat(x, y, median.x)
+    # Where that turns a tet over, the shape that was carried over is as good a guess.
+    repeated = equilibria.free_turning.repeat(x, y, median.x)
+    y = repeated if np.isfinite(equilibria.final_gradient(rho, median, repeated)[1]) else y
     return equilibrate(equilibria, rho, held, median.x, median.forces, y, max_iterations=100)
 
 

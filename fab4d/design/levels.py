@@ -2,15 +2,18 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
 from fab4d.design.patches import build_patches
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search
+from fab4d.elasticity.untangle import untangle
 from fab4d.mesh.coarsening import nearest_tets
 from fab4d.mesh.interpolation import closest_shape
 from fab4d.mesh.measures import deformation_gradients
-from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,8 @@ def carried_up(level: Level, at: Search) -> Search | None:
     fine, ratio, design = level.fine, level.coarse.length / level.fine.length, at.design
     radius, centers = at.patch_radius * ratio, level.vertices[at.equilibria.patches.centers]
     equilibria = Equilibria(fine, build_patches(fine, centers, radius))
-    x, y = (_shape(level, shape) for shape in (design.median.x, design.final.y))
+    x = _shape(level, design.median.x, fine.clamp)
+    y = _shape(level, design.final.y, np.zeros(fine.n_nodes, bool))
     forces = design.median.forces * (level.coarse.force / fine.force)
     carried = carried_over(equilibria, design.rho[level.tets], x, y, forces)
     if carried is None:
@@ -48,13 +52,17 @@ def carried_up(level: Level, at: Search) -> Search | None:
     return replace(at, equilibria=equilibria, design=carried, patch_radius=radius, relaxed_rms=relaxed_rms)
 
 
-def _shape(level: Level, shape: FloatArray) -> FloatArray:
+def _shape(level: Level, shape: FloatArray, clamp: BoolArray) -> FloatArray:
     """The coarse `shape` (N_c, 3) on the fine nodes (N, 3), whose tets are deformed as the coarse ones are.
 
-    Interpolated between the coarse nodes instead, tets outside the coarse surface may turn over.
+    clamp : (N,) fine nodes that are where the permanent shape has them
+    Interpolated between the coarse nodes instead, tets outside the coarse surface may turn over. Where tets are much
+    squeezed some do so even then, and are mended.
     """
-    coarse, X = level.coarse, level.fine.body.X
+    coarse, X, tets = level.coarse, level.fine.body.X, level.fine.body.elements
     F = deformation_gradients(coarse.body.X, shape, coarse.body.elements)[level.tets]
     goal = X.copy()
     goal[level.vertices] = shape * (coarse.length / level.fine.length)
-    return closest_shape(X, level.fine.body.elements, F, level.vertices, goal)
+    goal[clamp] = X[clamp]
+    fixed = np.union1d(level.vertices, np.flatnonzero(clamp))
+    return untangle(X, closest_shape(X, tets, F, fixed, goal), tets, clamp).x

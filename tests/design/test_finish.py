@@ -12,6 +12,8 @@ from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed, undecided_fraction
+from fab4d.design.turning import Turning
+from fab4d.mesh.rigid import best_rigid_motion
 
 TOLERANCE = 5e-3
 WEIGHTS = ObjectiveWeights(error_scale=TOLERANCE, lam_SMP=0.05, lam_smooth=0.3)
@@ -47,6 +49,26 @@ def test_what_is_carried_over_is_in_equilibrium_at_the_same_hold_positions(found
     again = carried_over(equilibria, design.rho, there.median.x, there.final.y, there.median.forces)
     assert again is not None
     np.testing.assert_allclose(again.median.x, there.median.x, atol=1e-6)
+
+
+def test_a_final_shape_that_cannot_be_repeated_is_a_guess_as_it_is(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the median's change, repeated on the final shape, would turn tets over."""
+    patches, design = found.equilibria.patches, found.design
+    equilibria = Equilibria(quadratic, patches_from_faces(quadratic, patches.centers, patches.faces, patches.offsets))
+    usual = carried_over(equilibria, design.rho, design.median.x, design.final.y, design.median.forces)
+    monkeypatch.setattr(Turning, "repeat", lambda _self, _before, after, _x: after * [1.0, 1.0, -1.0])
+    mended = carried_over(equilibria, design.rho, design.median.x, design.final.y, design.median.forces)
+    assert usual is not None
+    assert mended is not None
+    np.testing.assert_allclose(mended.median.x, usual.median.x, atol=1e-5)
+    np.testing.assert_allclose(mended.final.y, moved_rigidly(mended.final.y, usual.final.y), atol=1e-4)
+
+
+def moved_rigidly(onto: np.ndarray, y: np.ndarray) -> np.ndarray:
+    R, t = best_rigid_motion(y, onto)
+    return y @ R.T + t
 
 
 def test_a_design_is_rounded_in_the_other_elements(found: Search, quadratic: Problem) -> None:

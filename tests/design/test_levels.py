@@ -1,6 +1,7 @@
 """A design of a coarse mesh, carried over to the fine one of the same part."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from fab4d.design.patches import build_patches
 from fab4d.design.problem import build_problem
 from fab4d.design.reduced import Search
 from fab4d.mesh.coarsening import coarsened
+from fab4d.mesh.measures import deformation_gradients
 
 DENSE = 6.0
 """Patch radius, mm."""
@@ -59,6 +61,30 @@ def test_a_design_is_carried_over_in_equilibrium(level: Level, found: Search) ->
     assert np.abs(apart).max() < 0.1 * DENSE
     moved = design.final.y[level.vertices] * fine.length - found.design.final.y * level.coarse.length
     assert np.abs(moved).max() < 0.05 * SIZE[0]
+
+
+def test_tets_that_turn_over_on_the_way_are_mended(
+    level: Level, found: Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, closest = carried_up(level, found), levels.closest_shape
+    body, outer = level.fine.body, np.union1d(level.fine.faces, np.flatnonzero(level.fine.clamp))
+    inner = np.setdiff1d(np.arange(level.fine.n_nodes), np.union1d(level.vertices, outer))[:2]
+    turned = []
+
+    def through_its_tets(*args: Any) -> np.ndarray:
+        shape = closest(*args)
+        shape[inner, 2] += 0.08
+        turned.append(np.linalg.det(deformation_gradients(body.X, shape, body.elements)).min())
+        return shape
+
+    monkeypatch.setattr(levels, "closest_shape", through_its_tets)
+    up = carried_up(level, found)
+    assert len(inner)
+    assert max(turned) < 0
+    assert usual is not None
+    assert up is not None
+    np.testing.assert_allclose(up.design.median.x, usual.design.median.x, atol=1e-4)
+    np.testing.assert_allclose(up.design.final.y, usual.design.final.y, atol=1e-4)
 
 
 def test_without_an_equilibrium_nothing_is_carried_over(
