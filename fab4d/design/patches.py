@@ -56,8 +56,8 @@ def build_patches(problem: Problem, centers: IntArray, radius: float) -> Patches
     """Patches of the given dimensionless radius around boundary vertices outside the clamp.
 
     A patch holds the boundary faces at its centre and those whose centroid is within the radius, connected to it and
-    not facing away from it. Faces with a clamped corner are left out, and but for those at its centre, faces that touch
-    another patch.
+    not facing away from it. Faces with a clamped corner are left out. What several patches reach is shared: each vertex
+    goes to the nearest centre, and but for those at a centre, faces between two patches are left out.
     """
     usable = np.flatnonzero(~problem.clamp[problem.faces].any(axis=1))
     faces = problem.faces[usable]
@@ -65,14 +65,22 @@ def build_patches(problem: Problem, centers: IntArray, radius: float) -> Patches
     normals = face_area_vectors(X, faces)
     centroids = X[faces].mean(axis=1)
     incident = [(faces == center).any(axis=1) for center in centers]
-    owner = np.full(len(X), -1)
+
+    def reached(center: int, mine: IntArray) -> IntArray:
+        return mine[_grow(X, faces[mine], normals[mine], centroids[mine], center, radius)]
+
+    owner, nearest = np.full(len(X), -1), np.full(len(X), np.inf)
+    for k, center in enumerate(centers):
+        vertices = np.unique(faces[reached(center, np.arange(len(faces)))])
+        distance = np.linalg.norm(X[vertices] - X[center], axis=1)
+        nearer = distance < nearest[vertices]
+        owner[vertices[nearer]], nearest[vertices[nearer]] = k, distance[nearer]
     for k, at_center in reversed(list(enumerate(incident))):
         owner[faces[at_center]] = k
-    chosen = []
-    for k, center in enumerate(centers):
-        mine = np.flatnonzero(incident[k] | np.isin(owner[faces], (-1, k)).all(axis=1))
-        chosen.append(mine[_grow(X, faces[mine], normals[mine], centroids[mine], center, radius)])
-        owner[faces[chosen[-1]]] = k
+    chosen = [
+        reached(center, np.flatnonzero(incident[k] | (owner[faces] == k).all(axis=1)))
+        for k, center in enumerate(centers)
+    ]
     offsets = np.r_[0, np.cumsum([len(c) for c in chosen])].astype(np.int64)
     all_faces = faces[np.concatenate(chosen)] if len(chosen) else np.zeros((0, 3), np.int64)
     return patches_from_faces(problem, np.asarray(centers, np.int64), all_faces, offsets)

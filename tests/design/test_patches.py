@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from bars import CLAMPED, SIZE, bar, corner
+from bars import CARD, CLAMPED, SIZE, bar, corner
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
+from shapes.boxes import box
 
 from fab4d.design.patches import (
     Patches,
@@ -15,7 +16,7 @@ from fab4d.design.patches import (
     patches_from_faces,
     spread_centers,
 )
-from fab4d.design.problem import Problem
+from fab4d.design.problem import Problem, build_problem
 from fab4d.mesh.measures import face_area_vectors
 
 RADIUS_MM = 7.0
@@ -129,6 +130,29 @@ def test_a_patch_on_a_thin_plate_does_not_reach_through_it() -> None:
     top = corner(problem, (0.6, 0.5, 1.0))
     patches = build_patches(problem, np.array([top]), 1.5 * SIZE[2] / problem.length)
     assert problem.body.X[patches.faces].reshape(-1, 3)[:, 2].min() * problem.length == pytest.approx(SIZE[2])
+
+
+def test_patches_share_what_both_reach() -> None:
+    """The nearer one gets it, whichever comes first; a part under both is of one size for both."""
+    X, tets = box(SIZE, (20, 5, 4), "six")
+    # No vertex is as far from two centres.
+    X = X + 1e-3 * X**2 + 0.02 * X[:, [1, 2, 0]]
+    problem = build_problem(X, X, tets, X[:, 0] <= CLAMPED, CARD)
+    radius = RADIUS_MM / problem.length
+    centers = np.array([corner(problem, (share, 0.5, 1.0)) for share in (0.55, 0.7, 0.9)])
+    gaps = np.linalg.norm(np.diff(problem.body.X[centers], axis=0), axis=1)
+    assert (gaps < 1.5 * radius).all()
+    patches, turned = (build_patches(problem, each, radius) for each in (centers, centers[::-1]))
+    for k in range(3):
+        np.testing.assert_array_equal(faces_of(patches, k), faces_of(turned, 2 - k))
+    X = problem.body.X
+    areas = np.linalg.norm(face_area_vectors(X, patches.faces), axis=1)
+    assert np.add.reduceat(areas, patches.offsets[:-1]).min() > 0.3 * np.pi * radius**2
+    for k, center in enumerate(centers):
+        nodes = patches.nodes[patches.rows == k]
+        others = np.delete(centers, k)
+        nearest = cdist(X[nodes], X[others]).min(axis=1)
+        assert (np.linalg.norm(X[nodes] - X[center], axis=1) <= nearest + 1e-12).all()
 
 
 def test_faces_make_the_same_patches_again(problem: Problem, patches: Patches) -> None:
