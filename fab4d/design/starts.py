@@ -23,9 +23,9 @@ def random_centers(problem: Problem, count: int, seed: int) -> IntArray:
     return spread_centers(problem, count, np.random.default_rng(seed).choice(usable, size, replace=False))
 
 
-def beginnings(problem: Problem, settings: ReducedSettings, watch: Watch) -> Iterator[Search]:
-    """The relaxed designs that BEGINNINGS sets of random points lead to, but for those that lead to none."""
-    for seed in range(BEGINNINGS):
+def beginnings(problem: Problem, settings: ReducedSettings, watch: Watch, most: int = BEGINNINGS) -> Iterator[Search]:
+    """The relaxed designs that `most` sets of random points lead to, but for those that lead to none."""
+    for seed in range(most):
         centers = random_centers(problem, settings.n_points, seed)
         try:
             yield relaxed(problem, replace(settings, centers=centers), watch)

@@ -37,9 +37,8 @@ def objective_weights(
     problem: Problem, goal: Goal, weights: Weights, rig: RigCard, materials: MaterialCard
 ) -> ObjectiveWeights:
     """Weights of the objective: the scene's, or else those that count an error of the goal's tolerance as 1."""
-    tolerance = _usual_tolerance(problem) if goal.tolerance is None else goal.tolerance / problem.length
     return ObjectiveWeights(
-        error_scale=tolerance if weights.lam_pfinal is None else weights.lam_pfinal**-0.5,
+        error_scale=tolerance_of(problem, goal) if weights.lam_pfinal is None else weights.lam_pfinal**-0.5,
         lam_SMP=LAM_SMP if weights.lam_SMP is None else weights.lam_SMP,
         lam_mat=0.0 if weights.lam_mat is None else weights.lam_mat,
         lam_smooth=LAM_SMOOTH if weights.lam_smooth is None else weights.lam_smooth,
@@ -48,6 +47,11 @@ def objective_weights(
         smp_max_stretch=LIMIT_MARGIN * materials.smp_max_stretch,
         tpe_max_stretch=LIMIT_MARGIN * materials.tpe_max_stretch,
     )
+
+
+def tolerance_of(problem: Problem, goal: Goal) -> float:
+    """The largest RMS error, L0, that the goal allows."""
+    return _usual_tolerance(problem) if goal.tolerance is None else goal.tolerance / problem.length
 
 
 def _usual_tolerance(problem: Problem) -> float:

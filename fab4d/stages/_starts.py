@@ -7,7 +7,7 @@ import numpy as np
 
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, relaxed
-from fab4d.design.starts import beginnings
+from fab4d.design.starts import BEGINNINGS, beginnings
 from fab4d.errors import EquilibriumError
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.tetmesh import IntArray
@@ -29,7 +29,10 @@ BETTER, WELL_BELOW = 0.97, 0.85
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """What the search for other points needs; settings_of : of the solver, for a problem."""
+    """What the search for other points needs.
+
+    settings_of : of the solver, for a problem        most : sets of random points that are tried
+    """
 
     problem: Problem
     mesh: Mapping[str, np.ndarray]
@@ -37,6 +40,7 @@ class Starts:
     settings_of: Callable[[Problem], ReducedSettings]
     trace: Trace
     monitor: Monitor
+    most: int = BEGINNINGS
 
     def chosen(self) -> IntArray | None:
         """The centers (K,) that were found to be better than those of the settings, or None."""
@@ -100,7 +104,7 @@ class Starts:
             except EquilibriumError:
                 return none
         found, least = none, BETTER * usual
-        for at in beginnings(problem, settings, watch):
+        for at in beginnings(problem, settings, watch, self.most):
             if at.relaxed_rms < least:
                 found, least = vertices[at.equilibria.patches.centers], at.relaxed_rms
             if least <= WELL_BELOW * settings.weights.error_scale:

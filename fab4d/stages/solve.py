@@ -2,21 +2,22 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import rounded_from, rounded_in
-from fab4d.design.levels import Level, carried_up
+from fab4d.design.finish import rounded_in
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
+from fab4d.design.starts import BEGINNINGS
 from fab4d.errors import EquilibriumError, SceneError
 from fab4d.io.scene import Goal, RigCard, Weights
+from fab4d.stages._bring_up import COARSE_SHARE, affordable, brought_up, far_off
 from fab4d.stages._coarse import MANY_TETS, coarse_for
-from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds
+from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds, tolerance_of
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
@@ -33,14 +34,16 @@ LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors t
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 # A design rounded in the elements of the last fit needs no other, if its RMS error is at most this share of the
-# tolerance: repairs of its labels cost less than the rest. Relaxed designs beyond this multiple of it are not rounded
-# there.
-CERTAINLY_ENOUGH, OUT_OF_REACH = 0.5, 1.25
+# tolerance: repairs of its labels cost less than the rest.
+CERTAINLY_ENOUGH = 0.5
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
 NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
 # Where MANY_TETS are searched, for no coarser mesh does, they are rounded in about half the steps, none of which leads
 # past unstable states: that takes many times longer.
 FAST_GROWTH = 2.5
+# A coarse mesh is searched from so many times more random points where the usual ones nearly do: what is found there
+# saves steps on all tets, which take minutes.
+MORE_BEGINNINGS = 3
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
 # attempts as many times more.
 RELAXED_SHARE = 0.6
@@ -80,10 +83,11 @@ def _designed(
     element: str,
     trace: Trace,
     monitor: Monitor,
+    more_beginnings: int = 1,
 ) -> tuple[Search, Search, dict[str, Any]]:
     """The design of all attempts, with the least SMP if the goal asks for that, it before rounding, and what the report
     says of it."""
-    searched = _search(problem, mesh, profile, element, trace, monitor)
+    searched = _search(problem, mesh, profile, element, trace, monitor, more_beginnings)
     least = None
     if profile["goal"].smp == "least":
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
@@ -119,52 +123,29 @@ def _designed_coarse(
     chain = coarse_for(problem, mesh, profile["materials"], element, monitor)
     if not chain:
         return None
-    coarse, finer_mesh = chain[-1], chain[-2].mesh if len(chain) > 1 else mesh
+    coarse, goal = chain[-1], profile["goal"]
     own = trace.on(coarse.level.coarse, coarse.mesh)
+    tolerance = COARSE_SHARE * tolerance_of(problem, goal) * problem.length
+    lower = dict(profile) | {"goal": replace(goal, tolerance=tolerance)}
     try:
         found, before, report = _designed(
-            coarse.level.coarse, coarse.mesh, profile, "linear", own, Prefixed(monitor, "coarse-")
+            coarse.level.coarse, coarse.mesh, lower, "linear", own, Prefixed(monitor, "coarse-"), MORE_BEGINNINGS
         )
     except EquilibriumError:
         return None
+
+    def settings_of(finer: Problem) -> ReducedSettings:
+        return search_settings(finer, profile, report["attempts"] - 1)
+
     levels = [each.level for each in reversed(chain)]
-    finer = trace.on(coarse.level.fine, finer_mesh)
-    rounded = _rounded_up(levels[0], before, profile, report["attempts"] - 1, finer)
-    at, left = (found, levels) if rounded is None else (rounded, levels[1:])
-    carried = _carried_up_all(left, at)
+    meshes = [mesh, *(each.mesh for each in chain[:-1])][::-1]
+    traces = [trace.on(level.fine, finer).add for level, finer in zip(levels, meshes, strict=True)]
+    carried = brought_up(levels, before, found, settings_of, goal, traces)
     if carried is None:
         return None
-    if left:
-        trace.add("carried over", carried)
     why = f"the design is found on {coarse.level.coarse.n_tets} tets of the same part and carried over"
     left_out = [*report["left_out"], {"what": f"search on all {problem.n_tets} tets", "why": why}]
     return carried, report | {"left_out": left_out}
-
-
-def _carried_up_all(levels: Sequence[Level], at: Search | None) -> Search | None:
-    for level in levels:
-        at = None if at is None else carried_up(level, at)
-    return at
-
-
-def _rounded_up(level: Level, before: Search, profile: Mapping[str, Any], attempt: int, trace: Trace) -> Search | None:
-    """The coarse design as it was before rounding, rounded on the finer mesh, whose equilibria are others.
-
-    None where it is not relaxed, finds no equilibrium there or on the way, or needs more SMP than the goal allows.
-    """
-    carried = carried_up(level, before) if before.phase is Phase.ROUND else None
-    if carried is None:
-        return None
-    settings = search_settings(level.fine, profile, attempt)
-    finished = rounded_from(carried, replace(settings, nearly=1.0), trace.add)
-    return finished if _affordable(finished, profile["goal"]) else None
-
-
-def _affordable(finished: Search | None, goal: Goal) -> bool:
-    """Whether there is a design, and it keeps to the goal's share of SMP."""
-    if finished is None or goal.max_smp_fraction is None:
-        return finished is not None
-    return bool(finished.equilibria.problem.volume_fractions @ finished.design.rho <= goal.max_smp_fraction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,15 +180,11 @@ def _finished(
     None where these are linear, lose it on the way or need more SMP than the goal allows, and where it misses the
     tolerance by far.
     """
-    if element == "linear" or relaxed.phase is not Phase.ROUND or _far_off(relaxed, settings):
+    if element == "linear" or relaxed.phase is not Phase.ROUND or far_off(relaxed, settings):
         return None
     problem = problem_of(mesh, profile["materials"], element)
     finished = rounded_in(problem, relaxed, settings, trace.add)
-    return finished if _affordable(finished, profile["goal"]) else None
-
-
-def _far_off(relaxed: Search, settings: ReducedSettings) -> bool:
-    return relaxed.relaxed_rms > OUT_OF_REACH * settings.weights.error_scale
+    return finished if affordable(finished, profile["goal"]) else None
 
 
 def _picked(
@@ -240,6 +217,7 @@ def _search(
     element: str,
     trace: Trace,
     monitor: Monitor,
+    more_beginnings: int,
 ) -> _Searched:
     """The best design of the attempts.
 
@@ -250,9 +228,11 @@ def _search(
     before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
     count, finishes = _points(problem, profile, trace, monitor), dict[int, Search | None]()
     enough = profile["goal"].smp == "enough"
-    starts = Starts(
-        problem, mesh, profile["materials"], lambda other: search_settings(other, profile, 0, count), trace, monitor
-    )
+
+    def settings_of(other: Problem) -> ReducedSettings:
+        return search_settings(other, profile, 0, count)
+
+    starts = Starts(problem, mesh, profile["materials"], settings_of, trace, monitor, most=more_beginnings * BEGINNINGS)
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
         watch = _watch(attempt, start, trace, monitor, before_rounding)
@@ -278,7 +258,7 @@ def _search(
     last = before_rounding[-1]
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
-    left_out = [NOT_QUADRATIC] if element == "quadratic" and _far_off(last, settings) else []
+    left_out = [NOT_QUADRATIC] if element == "quadratic" and far_off(last, settings) else []
     return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt), left_out)
 
 

@@ -13,7 +13,7 @@ from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, at_rest
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
-from fab4d.stages import _coarse, solve
+from fab4d.stages import _bring_up, _coarse, solve
 from fab4d.stages._design import problem_of
 from fab4d.stages._figures import limits_of
 from fab4d.stages.monitor import SilentMonitor
@@ -200,11 +200,55 @@ def test_the_design_is_rounded_where_tets_are_small(
     assert carried_phases(between)[-1] == "carried over"
     assert between["relaxed"]["rho"].shape == (len(fine_bar["tets"]),)
     monkeypatch.setattr(_coarse, "MOST_ROUNDED", 10**6)
-    monkeypatch.setattr(solve, "rounded_from", lambda *_: None)
+    monkeypatch.setattr(_bring_up, "rounded_from", lambda *_: None)
     coarse = solved(fine_bar, goal)
     assert carried_phases(coarse) == ["carried over"]
     errors["coarse"] = off_by(fine_bar, coarse)
     assert errors["all"] < errors["coarse"]
+
+
+@pytest.mark.usefixtures("few")
+def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once more after the mesh between; where the way there is lost, the labels of that serve."""
+    monkeypatch.setattr(_coarse, "MOST_ROUNDED", 1_000)
+    monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
+    goal = Goal(tolerance=0.12, max_forces=4)
+    found = solved(fine_bar, goal)
+    once = carried_phases(found)
+    assert once.count("carried over") == 2
+    assert once[-1] == "round"
+    whole = once[len(once) - once[::-1].index("carried over") :]
+    assert whole[0] == "relax"
+    assert off_by(fine_bar, found) <= 0.12
+    rounded_from, n_tets = _bring_up.rounded_from, len(fine_bar["tets"])
+
+    def lost_on_all(carried: Search, *rest: Any) -> Search | None:
+        return None if len(carried.design.rho) == n_tets else rounded_from(carried, *rest)
+
+    monkeypatch.setattr(_bring_up, "rounded_from", lost_on_all)
+    served = solved(fine_bar, goal)
+    assert carried_phases(served)[-1] == "carried over"
+    assert off_by(fine_bar, served) > off_by(fine_bar, found)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_coarse_mesh_is_searched_for_less_than_the_tolerance(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float | None] = []
+    designed = solve._designed
+
+    def watched(problem: Any, mesh: Any, profile: Any, *rest: Any) -> Any:
+        asked.append(profile["goal"].tolerance)
+        return designed(problem, mesh, profile, *rest)
+
+    monkeypatch.setattr(solve, "_designed", watched)
+    solved(fine_bar, Goal(tolerance=0.6, max_forces=4))
+    solved(fine_bar, Goal(max_forces=4))
+    usual = limits_of(Goal(), Acceptance(), PROFILE["rig"], shapes_of(fine_bar, None)).tolerance
+    assert asked == [pytest.approx(0.8 * 0.6), pytest.approx(0.8 * usual)]
 
 
 @pytest.mark.usefixtures("few")
@@ -214,7 +258,7 @@ def test_a_design_that_needs_too_much_smp_when_rounded_again_is_not_taken(
     def all_smp(carried: Search, settings: Any, watch: Any) -> Search:  # noqa: ARG001
         return replace(carried, design=replace(carried.design, rho=np.ones(len(carried.design.rho))))
 
-    monkeypatch.setattr(solve, "rounded_from", all_smp)
+    monkeypatch.setattr(_bring_up, "rounded_from", all_smp)
     assert solved(fine_bar, Goal(tolerance=0.6, max_forces=4))["relaxed"]["rho"].min() == 1.0
     limited = solved(fine_bar, Goal(tolerance=0.6, max_forces=4, max_smp_fraction=0.9))
     assert limited["relaxed"]["rho"].min() < 0.5
@@ -230,7 +274,7 @@ def off_by(mesh: dict[str, np.ndarray], found: dict[str, Any]) -> float:
 def test_a_design_that_is_lost_on_the_whole_mesh_is_searched_there(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(solve, "carried_up", lambda *_: None)
+    monkeypatch.setattr(_bring_up, "carried_up", lambda *_: None)
     found = solved(fine_bar, Goal(tolerance=0.6, max_forces=4))
     assert found["relaxed"]["rho"].shape == (len(fine_bar["tets"]),)
     assert not any(left["what"].startswith("search on") for left in found["solve_report"]["left_out"])

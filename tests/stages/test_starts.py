@@ -89,7 +89,7 @@ def test_other_points_are_looked_for_where_the_tolerance_is_nearly_met(
 def begun_with(first: Search, ends: Mapping[int, float], seen: list[int]) -> Any:
     """Beginnings whose only centre is the index of the point that is moved, and the errors, mm, that they end with."""
 
-    def beginnings(problem: Problem, settings: ReducedSettings, watch: Any) -> Any:  # noqa: ARG001
+    def beginnings(problem: Problem, settings: ReducedSettings, watch: Any, most: int) -> Any:  # noqa: ARG001
         for vertex, rms in ends.items():
             seen.append(vertex)
             patches = build_patches(problem, np.array([vertex]), 0.03)
