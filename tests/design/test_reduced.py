@@ -127,14 +127,15 @@ def test_loading_finds_the_first_shape_where_newton_does_not(truth: Truth, monke
 
 
 def test_larger_patches_are_taken_where_small_ones_stretch_too_far(truth: Truth) -> None:
+    """With one point: several large patches on this bar share what they cover, and then none grows with the radius."""
     problem, radii = truth.problem, tuple(radius / truth.problem.length for radius in (3.0, 9.0))
-    small, large = (first_search(problem, settings_for(problem, patch_radii=(radius,))) for radius in radii)
+    small, large = (first_search(problem, settings_for(problem, n_points=1, patch_radii=(radius,))) for radius in radii)
     stretches = [largest_stretch(problem, found.design.median.x) for found in (small, large)]
     assert stretches[1] < stretches[0]
     between = 0.5 * sum(stretches)
     for limit, expected in ((2 * stretches[0], radii[0]), (between, radii[1]), (1.01, radii[1])):
         weights = WEIGHTS.replace(smp_max_stretch=limit, tpe_max_stretch=limit)
-        found = first_search(problem, settings_for(problem, patch_radii=radii, weights=weights))
+        found = first_search(problem, settings_for(problem, n_points=1, patch_radii=radii, weights=weights))
         assert found.patch_radius == expected
         assert np.isclose(largest_stretch(problem, found.design.median.x), stretches[radii.index(expected)])
 
@@ -151,12 +152,12 @@ def test_larger_patches_are_taken_where_small_ones_pull_too_hard(truth: Truth, m
     def with_limit(limit: float) -> Search:
         tried.clear()
         monkeypatch.setattr(reduced, "LARGEST_TRACTION", limit)
-        return first_search(problem, settings_for(problem, patch_radii=radii))
+        return first_search(problem, settings_for(problem, n_points=1, patch_radii=radii))
 
     monkeypatch.setattr(reduced, "build_patches", kept)
     tractions = {}
     for radius in (radii[0], radii[2]):
-        found = first_search(problem, settings_for(problem, patch_radii=(radius,)))
+        found = first_search(problem, settings_for(problem, n_points=1, patch_radii=(radius,)))
         tractions[radius] = largest_traction(found.equilibria.patches, problem, found.design.median)
     small, large = tractions[radii[0]], tractions[radii[2]]
     assert large < 0.9 * small
