@@ -1,7 +1,7 @@
 """A design that was searched on a coarser mesh, brought to all tets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from fab4d.design.finish import rounded_from
 from fab4d.design.levels import Level, carried_up
@@ -18,14 +18,6 @@ OUT_OF_REACH = 1.25
 Add = Callable[[str, Search], None]
 
 
-@dataclass(frozen=True, eq=False)
-class _Brought:
-    """A design on one of the meshes: `relaxed`, where it is known so, and near 0/1 as `found`."""
-
-    relaxed: Search | None
-    found: Search
-
-
 def brought_up(
     levels: Sequence[Level],
     before: Search,
@@ -38,13 +30,16 @@ def brought_up(
 
     levels : from coarse to fine        settings_of : of a mesh        traces : shown each state of a level
 
-    The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one, and on
-    those after it where it would miss the tolerance.
+    The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one. On
+    those after it, where a step takes minutes and squeezed surfaces turn unstable on its way, it is only carried over:
+    the fit of the held positions to the printed labels gains most of what rounding them again would.
     """
-    at: _Brought | None = _Brought(before if before.phase is Phase.ROUND else None, found)
-    for number, (level, add) in enumerate(zip(levels, traces, strict=True)):
-        at = None if at is None else _one_up(level, at, settings_of(level.fine), goal, add, again=number == 0)
-    return None if at is None else at.found
+    first, *others = levels
+    relaxed = before if before.phase is Phase.ROUND else None
+    at = _one_up(first, relaxed, found, settings_of(first.fine), goal, traces[0])
+    for level, add in zip(others, traces[1:], strict=True):
+        at = None if at is None else _carried(level, at, add)
+    return at
 
 
 def affordable(finished: Search | None, goal: Goal) -> bool:
@@ -60,21 +55,17 @@ def far_off(relaxed: Search, settings: ReducedSettings) -> bool:
 
 
 def _one_up(
-    level: Level, at: _Brought, settings: ReducedSettings, goal: Goal, add: Add, *, again: bool
-) -> _Brought | None:
-    """The design on the finer mesh; rounded `again` there, or only where it misses the tolerance or hardly meets it on
-    the coarser one."""
+    level: Level, relaxed: Search | None, found: Search, settings: ReducedSettings, goal: Goal, add: Add
+) -> Search | None:
+    """The design on the finer mesh, rounded there where it is not far off; else as it is carried over."""
     tolerance = settings.weights.error_scale
-    relaxed = at.relaxed if again or at.relaxed is None or not far_off(at.relaxed, settings) else None
-    hardly = again or _rms(at.found) > COARSE_SHARE * tolerance
-    carried = None if relaxed is not None and hardly else _carried(level, at.found, add)
-    if carried is not None and _rms(carried) <= tolerance:
-        return _Brought(None, carried)
-    rounded = None if relaxed is None else _rounded(level, relaxed, settings, goal, add)
-    if rounded is not None and (carried is None or _rms(rounded.found) < _rms(carried)):
+    rounded = None
+    if relaxed is not None and not far_off(relaxed, settings):
+        rounded = _rounded(level, relaxed, settings, goal, add)
+    if rounded is not None and _rms(rounded) <= tolerance:
         return rounded
-    carried = carried or _carried(level, at.found, add)
-    return None if carried is None else _Brought(None, carried)
+    reached = [each for each in (rounded, _carried(level, found, add)) if each is not None]
+    return min(reached, key=_rms, default=None)
 
 
 def _carried(level: Level, at: Search, add: Add) -> Search | None:
@@ -84,21 +75,11 @@ def _carried(level: Level, at: Search, add: Add) -> Search | None:
     return carried
 
 
-def _rounded(level: Level, before: Search, settings: ReducedSettings, goal: Goal, add: Add) -> _Brought | None:
+def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
     """None where it finds no equilibrium on the way, or needs more SMP than the goal allows."""
-    start = carried_up(level, before)
-    if start is None:
-        return None
-    relaxed = None
-
-    def watch(phase: str, at: Search) -> None:
-        nonlocal relaxed
-        add(phase, at)
-        if at.phase is Phase.ROUND and at.iteration == 0:
-            relaxed = at
-
-    found = rounded_from(start, replace(settings, nearly=1.0), watch)
-    return _Brought(relaxed, found) if found is not None and affordable(found, goal) else None
+    start = carried_up(level, relaxed)
+    rounded = None if start is None else rounded_from(start, replace(settings, nearly=1.0), add)
+    return rounded if affordable(rounded, goal) else None
 
 
 def _rms(at: Search) -> float:

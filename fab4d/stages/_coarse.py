@@ -14,8 +14,9 @@ from fab4d.stages.monitor import Monitor
 
 # Meshes of more tets are searched on a coarser one of so many: steps on them take minutes, and hardly lead anywhere
 # where squeezed surfaces turn unstable in waves that coarse meshes are too stiff for.
-MANY_TETS, COARSE_TETS = 60_000, 20_000
-# The relaxed design is rounded on all tets, or where they are more than the first number, on a mesh of the second.
+MANY_TETS, COARSE_TETS = 40_000, 20_000
+# The relaxed design is rounded on all tets, or where they are more than the first number, on a mesh of the second, and
+# carried over from there.
 MOST_ROUNDED, ROUNDED_TETS = 100_000, 55_000
 # Coarser meshes that keep more than this share of the tets, for thin walls, gain nothing.
 MOST_KEPT = 0.6

@@ -123,11 +123,11 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
 @pytest.mark.parametrize(
     ("relaxed_rms", "n_tets", "down_to"),
     [
-        (0.3, 60_000, 0.345),  # far below the tolerance: the share above the relaxed error
-        (0.3, 60_001, 0.5),  # the same on a large mesh: what is good enough
-        (0.5, 60_001, 0.575),
+        (0.3, 40_000, 0.345),  # far below the tolerance: the share above the relaxed error
+        (0.3, 40_001, 0.5),  # the same on a large mesh: what is good enough
+        (0.5, 40_001, 0.575),
         (0.95, 1_000, 1.0),  # the tolerance comes first
-        (1.1, 60_001, 1.0),  # flips may win what the relaxed design lacks
+        (1.1, 40_001, 1.0),  # flips may win what the relaxed design lacks
         (1.2, 1_000, 1.38),  # out of reach: no more work than that of rounding
     ],
 )

@@ -208,32 +208,6 @@ def test_the_design_is_rounded_where_tets_are_small(
 
 
 @pytest.mark.usefixtures("few")
-def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
-    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once more after the mesh between; where the way there is lost, the labels of that serve."""
-    monkeypatch.setattr(_coarse, "MOST_ROUNDED", 1_000)
-    monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
-    goal = Goal(tolerance=0.12, max_forces=4)
-    found = solved(fine_bar, goal)
-    once = carried_phases(found)
-    assert once.count("carried over") == 2
-    assert once[-1] == "round"
-    whole = once[len(once) - once[::-1].index("carried over") :]
-    assert whole[0] == "relax"
-    assert off_by(fine_bar, found) <= 0.12
-    rounded_from, n_tets = _bring_up.rounded_from, len(fine_bar["tets"])
-
-    def lost_on_all(carried: Search, *rest: Any) -> Search | None:
-        return None if len(carried.design.rho) == n_tets else rounded_from(carried, *rest)
-
-    monkeypatch.setattr(_bring_up, "rounded_from", lost_on_all)
-    served = solved(fine_bar, goal)
-    assert carried_phases(served)[-1] == "carried over"
-    assert off_by(fine_bar, served) > off_by(fine_bar, found)
-
-
-@pytest.mark.usefixtures("few")
 def test_a_coarse_mesh_is_searched_for_less_than_the_tolerance(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
