@@ -46,7 +46,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
-    design = _printed_design(equilibria, _relaxed_design(equilibria, relaxed), smp)
+    design = _printed_design(equilibria, relaxed, smp)
     trace.add("printed", Search(equilibria, design))
     fits, reached = 0, None
     if equilibria.patches.count:
@@ -76,12 +76,22 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     }
 
 
-def _printed_design(equilibria: Equilibria, design: Design, smp: FloatArray) -> Design:
-    """The printed labels in equilibrium: near the relaxed design, or else where loading from rest ends."""
+def _printed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], smp: FloatArray) -> Design:
+    """The printed labels in equilibrium: near the relaxed design, or else where loading from rest ends.
+
+    On more than MANY_TETS they are solved for at once: on the path of equilibria from the relaxed design to them, short
+    waves on squeezed surfaces turn unstable at every small step.
+    """
+    design = None
+    if equilibria.problem.n_tets > MANY_TETS:
+        design = _carried(equilibria, relaxed, smp)
+    if design is not None:
+        return design
+    before = _relaxed_design(equilibria, relaxed)
     try:
-        return change_density(equilibria, design, smp)
+        return change_density(equilibria, before, smp)
     except EquilibriumError:
-        return _programmed(program(equilibria, smp, design.median.x, design.median.forces), smp)
+        return _programmed(program(equilibria, smp, before.median.x, before.median.forces), smp)
 
 
 def _programmed(done: Programming, smp: FloatArray) -> Design:
@@ -159,13 +169,18 @@ def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -
 
     Raises EquilibriumError where these find no equilibrium near it.
     """
-    problem = equilibria.problem
-    x, y = (relaxed[name] / problem.length for name in ("x", "y"))
-    design = carried_over(equilibria, relaxed["rho"], x, y, relaxed["patch_force"] / problem.force)
+    design = _carried(equilibria, relaxed, relaxed["rho"])
     if design is None:
         msg = "the relaxed design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
         raise EquilibriumError(msg)
     return design
+
+
+def _carried(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], rho: FloatArray) -> Design | None:
+    """The density rho (m,) at the held positions of the relaxed design, from its shapes."""
+    problem = equilibria.problem
+    x, y = (relaxed[name] / problem.length for name in ("x", "y"))
+    return carried_over(equilibria, rho, x, y, relaxed["patch_force"] / problem.force)
 
 
 def limit_reasons(problem: Problem, patches: Patches, design: Design, profile: Mapping[str, Any]) -> list[str]:

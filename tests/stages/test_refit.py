@@ -13,11 +13,12 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings
 from fab4d.design.forward import balance, program, same_shape
 from fab4d.design.gauss_newton import Design
+from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import FloatArray
 from fab4d.stages import refit, solve, threshold
-from fab4d.stages._design import patches_of
+from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.threshold import labels_for
@@ -81,6 +82,27 @@ def test_loading_ends_in_the_fitted_state(inputs: Artifacts, fitted: tuple[str, 
     y = done.final.y * L0
     R, t = best_rigid_motion(y, printed["y"])
     np.testing.assert_allclose(y @ R.T + t, printed["y"], atol=1e-6)
+
+
+def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They end in the state that the path of equilibria from the relaxed design leads to."""
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    smp = inputs["rounded"]["smp"].astype(np.float64)
+    by_path = refit._printed_design(equilibria, inputs["relaxed"], smp)
+
+    def not_taken(*_: Any) -> Design:
+        raise AssertionError
+
+    monkeypatch.setattr(refit, "MANY_TETS", 1)
+    monkeypatch.setattr(refit, "change_density", not_taken)
+    at_once = refit._printed_design(equilibria, inputs["relaxed"], smp)
+    np.testing.assert_allclose(at_once.median.x, by_path.median.x, atol=1e-5)
+    R, t = best_rigid_motion(at_once.final.y, by_path.final.y)
+    np.testing.assert_allclose(at_once.final.y @ R.T + t, by_path.final.y, atol=1e-5)
+    monkeypatch.setattr(refit, "carried_over", lambda *_: None)
+    with pytest.raises(EquilibriumError, match="no equilibrium"):
+        refit._printed_design(equilibria, inputs["relaxed"], smp)
 
 
 def test_the_end_of_the_loading_is_handed_on(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
