@@ -84,10 +84,11 @@ def polish_labels(
     value = evaluate(equilibria, plain, L, design)
     finer = fineness(equilibria.problem)
     factors, batch, poor = np.array(FIRST_FACTORS), int(FIRST_BATCH * finer), 0
+    modes: ErrorModes | None = None
     for _ in range(settings.rounds):
         if not batch or poor == 2 or shape_error(equilibria.problem, design.final.y).rms <= settings.target_rms:
             break
-        modes = error_modes(equilibria, design)
+        modes = error_modes(equilibria, design) if modes is None else modes
         flips = choose_flips(equilibria.problem, modes, design.rho, factors, settings, batch)
         if not len(flips):
             break
@@ -101,7 +102,7 @@ def polish_labels(
         poor = poor + 1 if new > (1 - LEAST_ROUND_GAIN) * value else 0
         batch = min(batch * 3 // 2, int(LARGEST_BATCH * finer)) if new < value else max(batch // 3, 1)
         if new < value:
-            design, value = fitted, new
+            design, value, modes = fitted, new, None
             watch(Search(equilibria, design))
     return refit(equilibria, design, weights, watch) if design is not start else start
 

@@ -11,7 +11,7 @@ from fab4d.design.finish import carried_over
 from fab4d.design.flips import FlipSettings, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design
-from fab4d.design.objective import ObjectiveWeights
+from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, change_density, polished, refit
@@ -112,20 +112,31 @@ def _loaded_arrays(reached: Programming, problem: Problem) -> dict[str, np.ndarr
 def _reachable_fit(
     equilibria: Equilibria, design: Design, weights: ObjectiveWeights, polish: Polish, trace: Trace
 ) -> tuple[Design, int, Programming | None]:
-    """Fit positions and labels; again from where loading ends while that is elsewhere.
+    """Fit positions and labels, and simulate the loading to them: the state in which that ends is what the rig gets.
 
-    Returns the fits made too, and the loading that reaches the design, None where none does.
+    Where it is another equilibrium than the fit's, and misses the tolerance, the fit goes on from there. Returns the
+    state nearest to the temporary shape among those that loading ended in, the fits made, and its loading; the last fit
+    and None where no loading went all the way.
     """
+    ends = list[tuple[float, Design, Programming]]()
     for fit in range(1, MOST_FITS + 1):
         design = polish(refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
-        if same_shape(done, design.median.x):
-            return design, fit, done
-        if fit == MOST_FITS:
-            return design, fit, None
-        design = _programmed(done, design.rho)
-        trace.add("reached", Search(equilibria, design))
-    raise AssertionError  # the loop returns
+        end = _programmed(done, design.rho)
+        rms = shape_error(equilibria.problem, end.final.y).rms
+        there, whole = same_shape(done, design.median.x), done.loaded == done.unloaded == 1.0
+        if whole:
+            ends.append((rms, end, done))
+        if not there:
+            trace.add("reached", Search(equilibria, end))
+        if there or (whole and rms <= weights.error_scale):
+            break
+        if fit < MOST_FITS:
+            design = end
+    if not ends:
+        return design, fit, None
+    _, nearest, loading = min(ends, key=lambda each: each[0])
+    return nearest, fit, loading
 
 
 def _polish(

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from bent_bar import bent_bar
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings
-from fab4d.design.forward import balance, program, same_shape
+from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
@@ -113,13 +114,37 @@ def test_the_end_of_the_loading_is_handed_on(inputs: Artifacts, fitted: tuple[st
     assert loaded["load_steps"] > 2
 
 
-def test_no_loading_is_handed_on_that_does_not_reach_the_design(
+def test_no_loading_is_handed_on_that_does_not_go_all_the_way(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
+    monkeypatch.setattr(refit, "program", lambda *given: replace(program(*given), loaded=0.9))
     found = refit.run(inputs, PROFILE, SilentMonitor())
     assert found["loaded"] is None
     assert found["refit_report"]["fits"] == refit.MOST_FITS
+
+
+@pytest.mark.parametrize("tolerance", [1e9, 1e-9])
+def test_the_best_state_that_loading_ends_in_is_delivered(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, tolerance: float
+) -> None:
+    """Loading that ends in other equilibria than the fits': the first within the tolerance, or else the nearest one."""
+    ends = list[Programming]()
+
+    def elsewhere(equilibria: Equilibria, rho: np.ndarray, x: np.ndarray, forces: np.ndarray) -> Programming:
+        done = program(equilibria, rho, x, forces)
+        away = (0.002 if len(ends) == 1 else 0.01) * np.sin(3 * done.final.y[:, [1, 2, 0]])
+        ends.append(replace(done, final=replace(done.final, y=done.final.y + away)))
+        return ends[-1]
+
+    monkeypatch.setattr(refit, "program", elsewhere)
+    monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
+    monkeypatch.setattr(refit, "polished", lambda equilibria, design: design)  # noqa: ARG005
+    found = refit.run(inputs, PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=4)}, SilentMonitor())
+    assert found["refit_report"]["fits"] == len(ends) == (1 if tolerance > 1 else refit.MOST_FITS)
+    L0 = equilibria_of(inputs, found).problem.length
+    wanted = ends[0] if tolerance > 1 else ends[1]
+    np.testing.assert_array_equal(found["printed"]["y"], wanted.final.y * L0)
+    np.testing.assert_array_equal(found["loaded"]["y"], wanted.final.y * L0)
 
 
 def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
