@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median
 from fab4d.design.objective import (
@@ -17,6 +17,7 @@ from fab4d.design.objective import (
     objective_value,
     shape_error,
     shape_metric,
+    squeeze,
     stretch_excess,
 )
 from fab4d.design.sensitivity import Change, Linearisation, linearise
@@ -75,7 +76,7 @@ class Model:
     gradient_rho (m,), gradient_c (3K,) : gradient of the objective
     dy_dc (3N, 3K), df_dc (3K, 3K) : derivatives of final shape and forces with respect to the held positions
     dx_dc (3N, 3K) : derivative of the median shape with respect to the held positions
-    force_rows (k, 3K), stretch_rows (k, 3N) : derivatives of the active limits
+    force_rows (k, 3K), shape_rows (k, 3N) : derivatives of the active limits of forces and stretches
     H_cc (3K, 3K) : Gauss-Newton Hessian of the held positions
     """
 
@@ -87,7 +88,7 @@ class Model:
     df_dc: FloatArray
     dy_dc: FloatArray
     force_rows: FloatArray
-    stretch_rows: csr_array
+    shape_rows: csr_array
     H_cc: FloatArray
     moved_cc: FloatArray
     terms: DensityTerms
@@ -116,8 +117,8 @@ class DampedModel:
 
     def _pull_back(self, change: Change) -> Change:
         """Gradients of the quadratic terms with respect to x, f and y at a change of these."""
-        rows, stretch = self.model.force_rows, self.model.stretch_rows
-        gx = stretch.T @ (stretch @ change.x) + self.moves * change.x
+        rows, shape_rows = self.model.force_rows, self.model.shape_rows
+        gx = shape_rows.T @ (shape_rows @ change.x) + self.moves * change.x
         return Change(gx, rows.T @ (rows @ change.f), self.model.metric.apply(change.y))
 
     def _onto_held(self, g: Change) -> FloatArray:
@@ -161,13 +162,16 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
     gy = 2 * problem.area_weights[:, None] * (error.e @ error.R) / weights.error_scale**2
     beyond = forces_beyond(weights, equilibria.patches, design.median)
     stretch = stretch_excess(problem, weights, design.rho, design.median.x)
-    gx, gf = (stretch.rows.T @ stretch.values).reshape(-1, 3), (beyond.rows.T @ beyond.values).reshape(-1, 3)
+    squeezed = squeeze(problem, weights, design.median.x)
+    shape_rows = vstack([stretch.rows, squeezed.rows], format="csr")
+    shape_values = np.concatenate([stretch.values, squeezed.values])
+    gx, gf = (shape_rows.T @ shape_values).reshape(-1, 3), (beyond.rows.T @ beyond.values).reshape(-1, 3)
     g_rho, g_c = lin.adjoint(gx, gf, gy)
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
     metric = shape_metric(problem, design.final.y, weights.error_scale)
     dx_dc, df_dc, dy_dc = lin.held_columns()
     H = dy_dc.T @ metric.apply(dy_dc)
-    for limited in (beyond.rows @ df_dc, stretch.rows @ dx_dc):
+    for limited in (beyond.rows @ df_dc, shape_rows @ dx_dc):
         H += limited.T @ limited
     return Model(
         lin=lin,
@@ -178,7 +182,7 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
         df_dc=df_dc,
         dy_dc=dy_dc,
         force_rows=beyond.rows,
-        stretch_rows=stretch.rows,
+        shape_rows=shape_rows,
         H_cc=0.5 * (H + H.T),
         moved_cc=dx_dc.T @ dx_dc,
         terms=terms,

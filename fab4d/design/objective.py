@@ -22,6 +22,9 @@ class ObjectiveWeights:
     max_force : largest force of a patch, in mu_TPE L0^2          smp_, tpe_max_stretch : largest principal stretches
     pull_only : whether a force may not point into the surface
     limit : weight of the squared relative excess beyond these limits
+
+    least_stretch : smallest principal stretch below which tets count as squeezed
+    lam_squeeze : weight of the mean square, over the volume, of what the stretches of squeezed tets lack of it
     """
 
     error_scale: float
@@ -34,6 +37,8 @@ class ObjectiveWeights:
     tpe_max_stretch: float = np.inf
     pull_only: bool = False
     limit: float = 100.0
+    least_stretch: float = 0.0
+    lam_squeeze: float = 0.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
         """The same with other numbers."""
@@ -175,7 +180,6 @@ class StretchExcess:
 def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray, x: FloatArray) -> StretchExcess:
     """Principal stretches of x (N, 3) beyond the limit, which is mixed of the materials' by rho (m,)."""
     body = problem.body
-    nn = body.elements.shape[1]
     if np.isinf(weights.smp_max_stretch) or np.isinf(weights.tpe_max_stretch):
         return StretchExcess(np.zeros(0, np.int64), np.zeros(0), csr_array((0, x.size)), np.zeros(0))
     allowed = rho * weights.smp_max_stretch + (1 - rho) * weights.tpe_max_stretch
@@ -190,12 +194,55 @@ def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray,
     values = scale * (largest - allowed[tets])
     # d sigma_1 = u_1 . dF v_1
     along = np.einsum("kaj,kj->ka", dN[tets], Vt[over, 0])
-    data = scale[:, None, None] * along[:, :, None] * U[over, :, 0][:, None, :]
-    columns = (3 * body.elements[tets][:, :, None] + np.arange(3)).reshape(-1)
-    indptr = np.arange(0, len(tets) * 3 * nn + 1, 3 * nn)
-    rows = csr_array((data.ravel(), columns, indptr), shape=(len(tets), x.size))
+    slope = scale[:, None, None] * along[:, :, None] * U[over, :, 0][:, None, :]
+    rows = _rows_of(body.elements[tets], slope, x.size)
     by_density = -scale * largest / allowed[tets] * (weights.smp_max_stretch - weights.tpe_max_stretch)
     return StretchExcess(tets, values, rows, by_density)
+
+
+@dataclass(frozen=True, eq=False)
+class Squeeze:
+    """The tets (k,) whose mean deformation gradient in the median shape squeezes them too far.
+
+    values (k,) : what the smallest principal stretch lacks of the least one, relative to it, times the root of
+    2 lam_squeeze v; half of their squares sum to the penalty
+    rows (k, 3N) : their derivatives with respect to x
+    """
+
+    tets: IntArray
+    values: FloatArray
+    rows: csr_array
+
+
+def squeeze(problem: Problem, weights: ObjectiveWeights, x: FloatArray) -> Squeeze:
+    """Smallest principal stretches of x (N, 3) below weights.least_stretch.
+
+    A free surface that is squeezed farther turns unstable in short waves (Biot, Appl. Sci. Res. A 12 (1963) 168): such
+    a shape depends on the way that leads to it.
+    """
+    body = problem.body
+    if weights.lam_squeeze == 0 or weights.least_stretch == 0:
+        return Squeeze(np.zeros(0, np.int64), np.zeros(0), csr_array((0, x.size)))
+    dN = body.dN.mean(axis=1)
+    F = np.einsum("mai,maj->mij", x[body.elements], dN)
+    # sigma_3 = det F / (sigma_1 sigma_2) >= 2 det F / |F|^2: most tets need no singular values.
+    near = np.flatnonzero(2 * np.linalg.det(F) < weights.least_stretch * (F**2).sum(axis=(1, 2)))
+    U, s, Vt = np.linalg.svd(F[near])
+    over = s[:, 2] < weights.least_stretch
+    tets, smallest = near[over], s[over, 2]
+    scale = np.sqrt(2 * weights.lam_squeeze * problem.volume_fractions[tets])
+    values = scale * (1 - smallest / weights.least_stretch)
+    # d sigma_3 = u_3 . dF v_3
+    along = np.einsum("kaj,kj->ka", dN[tets], Vt[over, 2])
+    slope = (-scale / weights.least_stretch)[:, None, None] * along[:, :, None] * U[over, :, 2][:, None, :]
+    return Squeeze(tets, values, _rows_of(body.elements[tets], slope, x.size))
+
+
+def _rows_of(elements: IntArray, slopes: FloatArray, n_columns: int) -> csr_array:
+    """(k, 3N) rows of derivatives (k, nn, 3) by the nodes of elements (k, nn)."""
+    k, width = len(elements), 3 * elements.shape[1]
+    columns = (3 * elements[:, :, None] + np.arange(3)).reshape(-1)
+    return csr_array((slopes.ravel(), columns, np.arange(0, k * width + 1, width)), shape=(k, n_columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,4 +284,5 @@ def objective_value(
     error = shape_error(problem, final.y).rms / weights.error_scale
     forces = 0.5 * float((forces_beyond(weights, equilibria.patches, median).values ** 2).sum())
     stretches = 0.5 * float((stretch_excess(problem, weights, rho, median.x).values ** 2).sum())
-    return error**2 + terms.value + forces + stretches
+    squeezed = 0.5 * float((squeeze(problem, weights, median.x).values ** 2).sum())
+    return error**2 + terms.value + forces + stretches + squeezed

@@ -8,7 +8,7 @@ from bars import TIGHT, bar, held_design, mixed_density, two_patches
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, held_positions
-from fab4d.design.objective import ObjectiveWeights, density_terms, smoothness_matrix
+from fab4d.design.objective import ObjectiveWeights, density_terms, smoothness_matrix, squeeze, stretch_excess
 from fab4d.design.sensitivity import linearise
 
 STEPS = 10.0 ** -np.arange(2.0, 7.0, 0.5)
@@ -73,7 +73,7 @@ def test_held_columns_are_forward_of_each_held_coordinate(moved: Moved) -> None:
 
 
 def weights_for(design: Design) -> ObjectiveWeights:
-    """All terms at work: one patch force beyond its limit, one within, and some tets stretched too far."""
+    """All terms at work: one patch force beyond its limit, one within, some tets stretched or squeezed too far."""
     sizes = np.linalg.norm(design.median.forces, axis=1)
     return ObjectiveWeights(
         error_scale=0.01,
@@ -84,6 +84,8 @@ def weights_for(design: Design) -> ObjectiveWeights:
         max_force=float(np.sqrt(sizes.min() * sizes.max())),
         smp_max_stretch=1.02,
         tpe_max_stretch=1.02,
+        least_stretch=0.99,
+        lam_squeeze=1000.0,
     )
 
 
@@ -91,7 +93,11 @@ def test_gradient_of_the_objective(moved: Moved) -> None:
     weights, L = weights_for(moved.at), smoothness_matrix(moved.equilibria.problem)
     model = build_model(moved.equilibria, weights, L, moved.at)
     assert len(model.force_rows) == 1
-    assert 0 < model.stretch_rows.shape[0] < len(moved.drho)
+    problem, x = moved.equilibria.problem, moved.at.median.x
+    stretched, squeezed = stretch_excess(problem, weights, moved.at.rho, x).tets, squeeze(problem, weights, x).tets
+    assert 0 < len(stretched) < len(moved.drho)
+    assert 0 < len(squeezed) < len(moved.drho)
+    assert model.shape_rows.shape[0] == len(stretched) + len(squeezed)
     slope = model.gradient_rho @ moved.drho + model.gradient_c @ moved.dc.ravel()
     assert best_error(lambda t: np.array([evaluate(moved.equilibria, weights, L, moved(t))]), np.array([slope])) < 1e-7
 
@@ -106,6 +112,21 @@ def test_gradient_vanishes_for_rigid_motions_of_the_final_shape(moved: Moved) ->
         assert np.abs(metric.apply(turn)).max() < 1e-9 * np.abs(metric.weights * turn).max()
     push = np.tile([1.0, 2.0, -1.0], len(y))
     assert np.abs(metric.apply(push)).max() < 1e-9 * np.abs(metric.weights * push).max()
+
+
+def test_squeezed_tets_are_those_whose_smallest_stretch_is_below_the_least(moved: Moved) -> None:
+    """A uniform squeeze that is turned: no tet counts at its own stretch, and all alike below it, by their volume."""
+    problem = moved.equilibria.problem
+    turn = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
+    x = problem.body.X @ (turn @ np.diag([0.6, 1.3, 1.1]) @ turn.T)
+    for least, lacking in ((0.599, None), (0.75, 0.2)):
+        weights = ObjectiveWeights(error_scale=1.0, least_stretch=least, lam_squeeze=7.0)
+        found = squeeze(problem, weights, x)
+        if lacking is None:
+            assert not len(found.tets)
+        else:
+            assert 0.5 * (found.values**2).sum() == pytest.approx(7.0 * lacking**2, rel=1e-12)
+    assert not len(squeeze(problem, ObjectiveWeights(error_scale=1.0, least_stretch=0.75), x).tets)
 
 
 @pytest.mark.parametrize("name", ["lam_SMP", "lam_mat", "lam_round", "lam_smooth"])
@@ -164,7 +185,7 @@ def dense_schur(
     W = np.diag(2 * np.repeat(a, 3) / weights.error_scale**2)
     P = np.eye(y.size) - modes @ np.linalg.solve(modes.T @ W @ modes, modes.T @ W)
     blocks = (P @ Jy).T @ W @ (P @ Jy) + moves * Jx.T @ Jx
-    for rows, J in ((model.force_rows, Jf), (model.stretch_rows.toarray(), Jx)):
+    for rows, J in ((model.force_rows, Jf), (model.shape_rows.toarray(), Jx)):
         blocks += (rows @ J).T @ (rows @ J)
     density = np.diag(model.terms.curvature + damping * problem.volume_fractions)
     blocks[:m, :m] += density + 2 * weights.lam_smooth * model.L.toarray()
@@ -210,11 +231,11 @@ def test_held_step_and_reduced_gradient_solve_the_whole_system(moved: Moved) -> 
     dc = damped.held_step(drho)
     change = model.lin.forward(drho, dc)
     rows = model.force_rows @ change[1].ravel()
-    stretched = model.stretch_rows @ change[0].ravel()
+    stretched = model.shape_rows @ change[0].ravel()
     pull = (
         model.dy_dc.T @ model.metric.apply(change[2].ravel())
         + model.df_dc.T @ (model.force_rows.T @ rows)
-        + model.dx_dc.T @ (model.stretch_rows.T @ stretched + damped.moves * change[0].ravel())
+        + model.dx_dc.T @ (model.shape_rows.T @ stretched + damped.moves * change[0].ravel())
     )
     factor, lower = damped.held_factor
     assert not lower
