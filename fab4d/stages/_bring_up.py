@@ -30,15 +30,14 @@ def brought_up(
 
     levels : from coarse to fine        settings_of : of a mesh        traces : shown each state of a level
 
-    The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one. On
-    those after it, where a step takes minutes and squeezed surfaces turn unstable on its way, it is only carried over:
-    the fit of the held positions to the printed labels gains most of what rounding them again would.
+    The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one, and on
+    those after it, where a step takes minutes, if it misses the tolerance there.
     """
     first, *others = levels
     relaxed = before if before.phase is Phase.ROUND else None
     at = _one_up(first, relaxed, found, settings_of(first.fine), goal, traces[0])
     for level, add in zip(others, traces[1:], strict=True):
-        at = None if at is None else _carried(level, at, add)
+        at = None if at is None else _farther_up(level, at, settings_of(level.fine), goal, add)
     return at
 
 
@@ -68,8 +67,22 @@ def _one_up(
     return min(reached, key=_rms, default=None)
 
 
+def _farther_up(level: Level, at: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
+    """The near 0/1 design on a mesh that is finer still."""
+    carried, tolerance = carried_up(level, at), settings.weights.error_scale
+    if carried is None or _rms(carried) <= tolerance or _rms(at) > OUT_OF_REACH * tolerance:
+        return _shown(carried, add)
+    rounded = rounded_from(carried, replace(settings, nearly=1.0), add)
+    if rounded is not None and affordable(rounded, goal) and _rms(rounded) < _rms(carried):
+        return rounded
+    return _shown(carried, add)
+
+
 def _carried(level: Level, at: Search, add: Add) -> Search | None:
-    carried = carried_up(level, at)
+    return _shown(carried_up(level, at), add)
+
+
+def _shown(carried: Search | None, add: Add) -> Search | None:
     if carried is not None:
         add("carried over", carried)
     return carried

@@ -208,6 +208,35 @@ def test_the_design_is_rounded_where_tets_are_small(
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.parametrize(("tolerance", "nearer"), [(0.12, 0.5), (0.12, 2.0), (0.12, None), (0.6, 0.5)])
+def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
+    fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch, tolerance: float, nearer: float | None
+) -> None:
+    """Once more after the mesh between; the labels of that serve where it comes to nothing, or is off farther."""
+    monkeypatch.setattr(_coarse, "MOST_ROUNDED", 1_000)
+    monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
+    rounded_from, n_tets, before = _bring_up.rounded_from, len(fine_bar["tets"]), list[float]()
+
+    def rounded_off(carried: Search, settings: Any, watch: Any) -> Search | None:
+        if len(carried.design.rho) < n_tets:
+            return rounded_from(carried, settings, watch)
+        problem, final = carried.equilibria.problem, carried.design.final
+        before.append(shape_error(problem, final.y).rms * problem.length)
+        if nearer is None:
+            return None
+        y = problem.X_temp + nearer * (final.y - problem.X_temp)
+        return replace(carried, design=replace(carried.design, final=replace(final, y=y)))
+
+    monkeypatch.setattr(_bring_up, "rounded_from", rounded_off)
+    found = solved(fine_bar, Goal(tolerance=tolerance, max_forces=4))
+    assert len(before) == (1 if tolerance == 0.12 else 0)
+    if before:
+        off = off_by(fine_bar, found) / before[0]
+        assert off == pytest.approx(1.0) if nearer != 0.5 else off < 0.6
+        assert carried_phases(found).count("carried over") == (1 if nearer == 0.5 else 2)
+
+
+@pytest.mark.usefixtures("few")
 def test_a_coarse_mesh_is_searched_for_less_than_the_tolerance(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
