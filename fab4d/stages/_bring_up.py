@@ -14,6 +14,8 @@ from fab4d.io.scene import Goal
 COARSE_SHARE = 0.8
 # Relaxed designs beyond this multiple of the tolerance are not rounded where that takes long.
 OUT_OF_REACH = 1.25
+# A design that was carried over may miss the tolerance by this much: the fit of its held positions wins back as much.
+WON_BY_FIT = 1.05
 
 Add = Callable[[str, Search], None]
 
@@ -31,7 +33,7 @@ def brought_up(
     levels : from coarse to fine        settings_of : of a mesh        traces : shown each state of a level
 
     The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one, and on
-    those after it, where a step takes minutes, if it misses the tolerance there.
+    those after it, where a step takes minutes, if it misses the tolerance there by more than the later fit wins back.
     """
     first, *others = levels
     relaxed = before if before.phase is Phase.ROUND else None
@@ -70,7 +72,7 @@ def _one_up(
 def _farther_up(level: Level, at: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
     """The near 0/1 design on a mesh that is finer still."""
     carried, tolerance = carried_up(level, at), settings.weights.error_scale
-    if carried is None or _rms(carried) <= tolerance or _rms(at) > OUT_OF_REACH * tolerance:
+    if carried is None or _rms(carried) <= WON_BY_FIT * tolerance or _rms(at) > OUT_OF_REACH * tolerance:
         return _shown(carried, add)
     rounded = rounded_from(carried, replace(settings, nearly=1.0), add)
     if rounded is not None and affordable(rounded, goal) and _rms(rounded) < _rms(carried):

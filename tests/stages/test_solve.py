@@ -208,7 +208,7 @@ def test_the_design_is_rounded_where_tets_are_small(
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize(("tolerance", "nearer"), [(0.12, 0.5), (0.12, 2.0), (0.12, None), (0.6, 0.5)])
+@pytest.mark.parametrize(("tolerance", "nearer"), [(0.1, 0.5), (0.1, 2.0), (0.1, None), (0.6, 0.5)])
 def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch, tolerance: float, nearer: float | None
 ) -> None:
@@ -229,11 +229,10 @@ def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
 
     monkeypatch.setattr(_bring_up, "rounded_from", rounded_off)
     found = solved(fine_bar, Goal(tolerance=tolerance, max_forces=4))
-    assert len(before) == (1 if tolerance == 0.12 else 0)
+    assert len(before) == (1 if tolerance == 0.1 else 0)
     if before:
         off = off_by(fine_bar, found) / before[0]
         assert off == pytest.approx(1.0) if nearer != 0.5 else off < 0.6
-        assert carried_phases(found).count("carried over") == (1 if nearer == 0.5 else 2)
 
 
 @pytest.mark.usefixtures("few")
