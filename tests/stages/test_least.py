@@ -65,7 +65,10 @@ def test_the_least_smp_that_is_acceptable_is_taken(scene: Scene, checked: dict[s
     mesh = checked["mesh"]
     edges = mesh["X"][mesh["tets"][:, 1:]] - mesh["X"][mesh["tets"][:, :1]]
     volumes = np.abs(np.linalg.det(edges))
-    assert volumes @ rho / volumes.sum() == pytest.approx(best["smp_fraction"], abs=0.06)
+    delivered = volumes @ rho / volumes.sum()
+    # It is rounded in other elements than the trials, whose labels are repaired.
+    assert min(trials, key=lambda trial: abs(trial["smp_fraction"] - delivered)) is best
+    assert delivered < 0.7 * trials[0]["smp_fraction"]
 
 
 def test_what_is_not_acceptable_says_why(searched: Searched) -> None:
