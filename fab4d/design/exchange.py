@@ -135,12 +135,9 @@ def _shape_by_force(model: Model, candidates: Patches, n_nodes: int) -> FloatArr
     n, k = lin.M.shape[0], 3 * lin.n_patches
     rhs = np.zeros((n + k, 3 * candidates.count))
     rhs[:n] = np.kron(candidates.operator(n_nodes).T.toarray(), np.eye(3))
-    rhs[lin.held_fixed] = 0.0
-    z = lin.held.solve_many(rhs)
-    r = -(lin.M @ z[:n])
-    r[lin.free_fixed] = 0.0
+    z, dy = lin.respond(rhs, np.zeros((n, rhs.shape[1])))
     of_points = np.linalg.solve(model.df_dc.T, model.dy_dc.T).T
-    return np.hstack([of_points, lin.free.solve_many(r) - of_points @ z[n:]])
+    return np.hstack([of_points, dy - of_points @ z[n:]])
 
 
 def better_points(model: ForceModel, count: int) -> list[list[int]]:

@@ -47,10 +47,16 @@ def equilibrate(
     max_iterations: int = 12,
     stay: bool = False,
 ) -> Design | None:
-    """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found."""
+    """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found.
+
+    Where the median shape is found moves from its guess, the guess of the final shape moves along: what stiff SMP has
+    frozen would else be bent in it.
+    """
     median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay)
     if not median.solution.converged:
         return None
+    turning = equilibria.free_turning
+    y = _ahead(turning.step, y, median.x - x, lambda y: equilibria.final_gradient(rho, median, y)[1])
     final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay)
     return Design(rho, median, final) if final.solution.converged else None
 

@@ -20,13 +20,16 @@ def _element_forces(equilibria: Equilibria, gradients: FloatArray, moduli: Modul
     return out
 
 
-def _density_columns(equilibria: Equilibria, forces: FloatArray) -> csc_array:
+def element_dofs(elements: IntArray) -> IntArray:
+    """(m, 3nn) dofs of the nodes of elements (m, nn)."""
+    return (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), -1)
+
+
+def force_columns(elements: IntArray, forces: FloatArray, n_nodes: int) -> csc_array:
     """(3N, m) matrix whose column j holds the nodal forces (nn, 3) of element j."""
-    elements = equilibria.problem.body.elements
-    m, nn = elements.shape
-    rows = (3 * elements[:, :, None] + np.arange(3)).reshape(m, 3 * nn)
-    indptr = np.arange(0, m * 3 * nn + 1, 3 * nn)
-    return csc_array((forces.ravel(), rows.ravel(), indptr), shape=(3 * equilibria.problem.n_nodes, m))
+    rows = element_dofs(elements)
+    indptr = np.arange(0, rows.size + 1, rows.shape[1])
+    return csc_array((forces.ravel(), rows.ravel(), indptr), shape=(3 * n_nodes, len(elements)))
 
 
 def _mixed_matrix(equilibria: Equilibria, rho: FloatArray, median: Median, y: FloatArray) -> bsr_array:
@@ -111,8 +114,17 @@ class Linearisation:
         lz = self.held.solve(rhs)
         return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:].reshape(-1, 3)
 
-    def adjoint_many(self, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradients with respect to rho (m, q) and held positions (3K, q) of q functions with gradients gy (3N, q)."""
+    def respond(self, hot: FloatArray, cold: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Changes of (x, f) (3N + 3K, q) and of y (3N, q) where loads change by hot (3N + 3K, q) and cold (3N, q)."""
+        n = self.M.shape[0]
+        hot[self.held_fixed] = 0.0
+        z = self.held.solve_many(hot)
+        cold = cold - self.M @ z[:n]
+        cold[self.free_fixed] = 0.0
+        return z, self.free.solve_many(cold)
+
+    def adjoint_states(self, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients by the loads of `respond`, (3N + 3K, q) and (3N, q), of q functions with gradients gy (3N, q)."""
         n = self.M.shape[0]
         b = gy.copy()
         b[self.free_fixed] = 0.0
@@ -120,8 +132,7 @@ class Linearisation:
         rhs = np.zeros((n + 3 * self.n_patches, gy.shape[1]))
         rhs[:n] = -(self.MT @ ly)
         rhs[self.held_fixed] = 0.0
-        lz = self.held.solve_many(rhs)
-        return -(self.R_xT @ lz[:n]) - self.R_yT @ ly, -lz[n:]
+        return self.held.solve_many(rhs), ly
 
     def held_columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """dx/dc, df/dc, dy/dc as (3N, 3K), (3K, 3K), (3N, 3K)."""
@@ -130,10 +141,8 @@ class Linearisation:
             return np.zeros((n, 0)), np.zeros((0, 0)), np.zeros((n, 0))
         rhs = np.zeros((n + k, k))
         rhs[n + np.arange(k), np.arange(k)] = -1.0
-        z = self.held.solve_many(rhs)
-        r = -(self.M @ z[:n])
-        r[self.free_fixed] = 0.0
-        return z[:n], z[n:], self.free.solve_many(r)
+        z, dy = self.respond(rhs, np.zeros((n, k)))
+        return z[:n], z[n:], dy
 
 
 def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Final) -> Linearisation:
@@ -145,8 +154,9 @@ def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Fi
     hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
     M = _mixed_matrix(equilibria, rho, median, final.y)
     cold = _element_forces(equilibria, median.gradients, problem.glassy, final.y - median.x)
-    R_x = _density_columns(equilibria, _element_forces(equilibria, body.dN, hot, median.x - body.X))
-    R_y = _density_columns(equilibria, cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X))
+    by_hot = _element_forces(equilibria, body.dN, hot, median.x - body.X)
+    by_cold = cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X)
+    R_x, R_y = (force_columns(body.elements, forces, problem.n_nodes) for forces in (by_hot, by_cold))
     return Linearisation(
         held=held,
         free=free,

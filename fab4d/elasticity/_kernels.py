@@ -194,6 +194,56 @@ def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
 
 
 @njit(cache=True)
+def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
+    """Adds the tangent stiffness of each element to blocks (m, nn, nn, 3, 3): d(force on a)/d(position of b)."""
+    nn = elements.shape[1]
+    H, C = np.zeros((3, 3)), np.zeros((3, 3))
+    f, g = np.zeros((nn, 3)), np.zeros((nn, 3))
+    for m in range(elements.shape[0]):
+        for q in range(dN.shape[1]):
+            _displacement_gradient(u, elements[m], dN[m, q], H)
+            jm1, e = _invariants(H, C)
+            _tangent_vectors(H, C, jm1, dN[m, q], f, g)
+            s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], weights[m, q])
+            for a in range(nn):
+                for b in range(nn):
+                    dot = s0 * (
+                        dN[m, q, a, 0] * dN[m, q, b, 0]
+                        + dN[m, q, a, 1] * dN[m, q, b, 1]
+                        + dN[m, q, a, 2] * dN[m, q, b, 2]
+                    )
+                    for i in range(3):
+                        for k in range(3):
+                            blocks[m, a, b, i, k] += (
+                                s1 * (f[b, k] * g[a, i] + g[b, k] * f[a, i])
+                                + s2 * g[a, i] * g[b, k]
+                                + s3 * g[b, i] * g[a, k]
+                            )
+                        blocks[m, a, b, i, i] += dot
+
+
+@njit(cache=True)
+def gather_blocks(elements, rank, indptr, data, blocks):
+    """Copies what a matrix that `tangent` assembled has between the nodes of each element: (m, nn, nn, 3, 3)."""
+    nn = elements.shape[1]
+    for m in range(elements.shape[0]):
+        pair = 0
+        for a0 in range(nn):
+            for b0 in range(a0 + 1):
+                a, b = a0, b0
+                if elements[m, a] < elements[m, b]:
+                    a, b = b0, a0
+                r = rank[m, pair]
+                for k in range(3):
+                    column = 3 * elements[m, b] + k
+                    for i in range(k if r < 0 else 0, 3):
+                        value = data[indptr[column] + (i - k if r < 0 else 3 - k + 3 * r + i)]
+                        blocks[m, a, b, i, k] = value
+                        blocks[m, b, a, k, i] = value
+                pair += 1
+
+
+@njit(cache=True)
 def _eigen_symmetric(A, V):
     """Cyclic Jacobi: eigenvectors of A (3, 3) as columns of V; A is overwritten, eigenvalues on its diagonal."""
     for i in range(3):

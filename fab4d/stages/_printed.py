@@ -46,14 +46,14 @@ def as_printed(
 
     Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
     """
-    _, smp = repaired(mesh, printer, goal, found)
+    settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
+    smp = repaired(mesh, printer, settings, found, weights.error_scale).smp
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))
     except EquilibriumError:
         return Printed(smp, np.inf, None)
     design = refit(found.equilibria, design, weights, lambda at: None)  # noqa: ARG005
     if good_enough < shape_error(problem, design.final.y).rms < HOPELESS * weights.error_scale:
-        settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
         design = polish_labels(found.equilibria, design, weights, settings, lambda at: None)  # noqa: ARG005
     return Printed(design.rho > 0.5, shape_error(problem, design.final.y).rms, design)
 

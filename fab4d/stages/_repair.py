@@ -1,43 +1,97 @@
-"""What a repair of labels may change first."""
+"""What a repair of labels may change first, and what makes up for it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
-from fab4d.design.flips import error_modes, whole_flips
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.flips import FlipSettings, at_interface, compensated, error_left
+from fab4d.design.gauss_newton import Design
+from fab4d.design.influence import Influence, influence
+from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search
-from fab4d.io.scene import Goal, PrinterCard
+from fab4d.io.scene import PrinterCard
 from fab4d.mesh.measures import tet_volumes
+from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages.threshold import labels_for
 
 # Of what a tet of average volume and influence costs, the share that its volume makes.
 VOLUME_SHARE = 0.1
-# Repairs by influence have to leave at most this share of the predicted error of those by volume: predictions, whole
-# flips added up by their derivatives, are off by some per cent.
+# A repair by another cost than the volume has to leave at most this share of the error predicted for that one.
 CLEARLY_BETTER = 0.96
+# The search for a repair ends at one of many, by which of equal costs comes first: so many more are made, each with
+# costs that are off by a random factor of this standard deviation of its logarithm.
+MORE_REPAIRS, SPREAD = 4, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """What changing each tet costs (m,), and the printable labels smp (m,) that follow, flips that make up included."""
+
+    cost: FloatArray
+    smp: BoolArray
 
 
 def repaired(
-    mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Goal, found: Search
-) -> tuple[np.ndarray, np.ndarray]:
-    """What changing each tet of a near 0/1 design costs (m,), and the printable labels (m,) that follow.
+    mesh: Mapping[str, np.ndarray], printer: PrinterCard, settings: FlipSettings, found: Search, error_scale: float
+) -> Repair:
+    """The repair of a near 0/1 design that promises the smallest error, SMP within the share that settings allow.
 
-    The cost is the tet's volume, or how far the flip moves the finished shape: the latter where it promises a clearly
-    smaller error, and SMP within the goal's share, for it turns TPE to SMP rather than SMP to TPE, which moves more.
+    error_scale : RMS error, L0, that is worth a move of the held positions
+
+    The cost is the tet's volume or how far its flip moves the finished shape: the latter where it promises a clearly
+    smaller error, for it turns TPE to SMP rather than SMP to TPE, which moves more.
     """
-    X, tets, rho = mesh["X"], mesh["tets"], found.design.rho
-    volumes = np.abs(tet_volumes(X, tets))
+    X, tets, rho, problem = mesh["X"], mesh["tets"], found.design.rho, found.equilibria.problem
+    volumes, before = np.abs(tet_volumes(X, tets)), found.design.rho > 0.5
     by_volume = volumes / volumes.mean()
     usual = labels_for(X, tets, rho, by_volume, printer).smp
-    if not found.equilibria.patches.count:
-        return by_volume, usual
-    change, error = whole_flips(error_modes(found.equilibria, found.design), rho)
-    moved = np.linalg.norm(change, axis=1)
-    if not moved.any():
-        return by_volume, usual
-    by_influence = VOLUME_SHARE * by_volume + (1 - VOLUME_SHARE) * moved / moved.mean()
-    other = labels_for(X, tets, rho, by_influence, printer).smp
-    left, left_usual = (np.linalg.norm(error + change[smp != (rho > 0.5)].sum(axis=0)) for smp in (other, usual))
-    most = 1.0 if goal.max_smp_fraction is None else goal.max_smp_fraction
-    affordable = volumes[other].sum() <= most * volumes.sum()
-    return (by_influence, other) if affordable and left <= CLEARLY_BETTER * left_usual else (by_volume, usual)
+    flips = influence_near(found.equilibria, found.design, usual, error_scale)
+    if flips is None or not flips.change.any():
+        return Repair(by_volume, usual)
+
+    def made(cost: FloatArray) -> tuple[float, Repair]:
+        smp = labels_for(X, tets, rho, cost, printer).smp
+        smp = compensated(problem, flips, before, smp, settings)
+        return error_left(flips, before, smp), Repair(cost, smp)
+
+    least, best = made(by_volume)
+    least *= CLEARLY_BETTER
+    for cost in _other_costs(by_volume, flips):
+        left, other = made(cost)
+        if left <= least and volumes[other.smp].sum() <= settings.max_smp_fraction * volumes.sum():
+            least, best = left, other
+    return best
+
+
+def influence_near(equilibria: Equilibria, design: Design, smp: BoolArray, error_scale: float) -> Influence | None:
+    """What flips do of the tets that labels smp (m,) change in a near 0/1 design, and of those beside an interface.
+
+    None where there are none, or no points whose forces could change.
+    """
+    problem, before = equilibria.problem, design.rho > 0.5
+    near = _beside(problem, at_interface(problem, smp) | at_interface(problem, before)) | (smp != before)
+    if not equilibria.patches.count or not near.any():
+        return None
+    return influence(equilibria, design, np.flatnonzero(near), error_scale)
+
+
+def _beside(problem: Problem, some: BoolArray) -> BoolArray:
+    """(m,) tets of `some` (m,) and their neighbours."""
+    first, second = problem.neighbours.T
+    result = some.copy()
+    result[first[some[second]]] = True
+    result[second[some[first]]] = True
+    return result
+
+
+def _other_costs(by_volume: FloatArray, flips: Influence) -> Iterator[FloatArray]:
+    moved = np.ones(len(by_volume))
+    moved[flips.tets] = np.linalg.norm(flips.change, axis=1)
+    moved[flips.tets] /= moved[flips.tets].mean()
+    by_influence = VOLUME_SHARE * by_volume + (1 - VOLUME_SHARE) * moved
+    yield by_influence
+    random = np.random.default_rng(0)
+    for base in (by_influence, by_volume) * (MORE_REPAIRS // 2):
+        yield base * np.exp(SPREAD * random.standard_normal(len(base)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import FlipSettings, polish_labels
+from fab4d.design.flips import FlipSettings, compensated, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -20,10 +20,11 @@ from fab4d.fabrication.labels import smp_clusters
 from fab4d.fabrication.wellcomposed import flip_check
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import tet_volumes
-from fab4d.mesh.tetmesh import FloatArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
 from fab4d.stages._element import element_for
+from fab4d.stages._repair import influence_near
 from fab4d.stages.monitor import Monitor
 from fab4d.stages.threshold import labels_for
 
@@ -40,18 +41,18 @@ Polish = Callable[[Design], Design]
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
-    smp = rounded["smp"].astype(np.float64)
     element, left_out = element_for(mesh, profile["solver"].element)
     problem = problem_of(mesh, profile["materials"], element)
     equilibria = Equilibria(problem, patches_of(problem, relaxed))
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
-    design = _printed_design(equilibria, relaxed, smp)
+    weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
+    settings = _flip_settings(inputs, profile, problem, weights)
+    design = _printed_design(equilibria, relaxed, rounded["smp"], weights, settings)
     trace.add("printed", Search(equilibria, design))
     fits, reached = 0, None
     if equilibria.patches.count:
-        weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
-        polish = _polish(inputs, profile, equilibria, weights, trace)
+        polish = _polish(equilibria, weights, settings, trace)
         design, fits, reached = _reachable_fit(equilibria, design, weights, polish, trace)
     smp = design.rho > 0.5
     design = polished(equilibria, design)
@@ -76,22 +77,32 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     }
 
 
-def _printed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], smp: FloatArray) -> Design:
-    """The printed labels in equilibrium: near the relaxed design, or else where loading from rest ends.
+def _printed_design(
+    equilibria: Equilibria,
+    relaxed: Mapping[str, np.ndarray],
+    smp: BoolArray,
+    weights: ObjectiveWeights,
+    settings: FlipSettings,
+) -> Design:
+    """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
 
-    On more than MANY_TETS they are solved for at once: on the path of equilibria from the relaxed design to them, short
-    waves on squeezed surfaces turn unstable at every small step.
+    On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
+    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair.
     """
     design = None
     if equilibria.problem.n_tets > MANY_TETS:
-        design = _carried(equilibria, relaxed, smp)
+        design = _carried(equilibria, relaxed, smp.astype(np.float64))
     if design is not None:
         return design
     before = _relaxed_design(equilibria, relaxed)
+    flips = influence_near(equilibria, before, smp, weights.error_scale)
+    if flips is not None:
+        smp = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
+    rho = smp.astype(np.float64)
     try:
-        return change_density(equilibria, before, smp)
+        return change_density(equilibria, before, rho)
     except EquilibriumError:
-        return _programmed(program(equilibria, smp, before.median.x, before.median.forces), smp)
+        return _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
 
 
 def _programmed(done: Programming, smp: FloatArray) -> Design:
@@ -139,19 +150,17 @@ def _reachable_fit(
     return nearest, fit, loading
 
 
-def _polish(
-    inputs: Mapping[str, Any],
-    profile: Mapping[str, Any],
-    equilibria: Equilibria,
-    weights: ObjectiveWeights,
-    trace: Trace,
-) -> Callable[[Design], Design]:
-    """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / equilibria.problem.length
-    down_to = flipped_down_to(relaxed_rms, weights.error_scale, equilibria.problem.n_tets)
+def _flip_settings(
+    inputs: Mapping[str, Any], profile: Mapping[str, Any], problem: Problem, weights: ObjectiveWeights
+) -> FlipSettings:
+    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
+    down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
-    if equilibria.problem.n_tets > MANY_TETS:
-        settings = replace(settings, rounds=FEW_ROUNDS)
+    return replace(settings, rounds=FEW_ROUNDS) if problem.n_tets > MANY_TETS else settings
+
+
+def _polish(equilibria: Equilibria, weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Polish:
+    """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
     return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
 
 

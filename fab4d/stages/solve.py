@@ -25,6 +25,7 @@ from fab4d.stages._repair import repaired
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages._starts import Starts
 from fab4d.stages.monitor import Monitor, Prefixed
+from fab4d.stages.refit import flip_settings
 
 CHECKPOINT, BEST, POINTS = "iterate", "best", "points"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
@@ -370,9 +371,11 @@ def _artifacts(
     mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], found: Search, trace: Trace, report: dict[str, Any]
 ) -> dict[str, Any]:
     problem, design = found.equilibria.problem, found.design
+    error_scale = search_settings(problem, profile).weights.error_scale
+    flips = flip_settings(mesh, profile["printer"], profile["goal"], error_scale)
     relaxed = {
         "rho": design.rho,
-        "repair_cost": repaired(mesh, profile["printer"], profile["goal"], found)[0],
+        "repair_cost": repaired(mesh, profile["printer"], flips, found, error_scale).cost,
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),

@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import TIGHT, bar, held_design, two_patches
+from bars import bar, held_design, two_patches
 
 from fab4d.design import flips
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import (
-    ErrorModes,
     FlipSettings,
     at_interface,
-    choose_flips,
-    error_modes,
+    compensated,
+    error_left,
+    flip,
     polish_labels,
-    whole_flips,
 )
 from fab4d.design.gauss_newton import Design, equilibrate, held_positions
+from fab4d.design.influence import Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
@@ -28,50 +28,13 @@ WEIGHTS = ObjectiveWeights(error_scale=1e-3)
 FREELY = FlipSettings(printable=lambda smp: smp, flippable=lambda smp, tet: True, target_rms=0.0)  # noqa: ARG005
 
 
-def modes_at(equilibria: Equilibria, design: Design) -> ErrorModes:
-    return error_modes(equilibria, design)
-
-
-def amplitudes(problem: Problem, modes: ErrorModes, design: Design, reference: Design) -> np.ndarray:
-    """Of the modes at the reference, in its frame."""
-    error = shape_error(problem, design.final.y)
-    return modes.directions.T @ (error.e @ shape_error(problem, reference.final.y).R).ravel()
+def at_all_tets(equilibria: Equilibria, design: Design) -> Influence:
+    return influence(equilibria, design, np.arange(equilibria.problem.n_tets), WEIGHTS.error_scale)
 
 
 def upper_half(problem: Problem) -> np.ndarray:
     X = problem.body.X
     return X[problem.body.elements].mean(axis=1)[:, 2] > 0.5 * X[:, 2].max()
-
-
-@pytest.mark.parametrize("element", ["linear", "quadratic"])
-def test_sensitivities_of_the_amplitudes_are_their_derivatives(element: str) -> None:
-    problem = bar(cells=(3, 1, 1), degrees=25.0, element=element)
-    equilibria = two_patches(problem)
-    random = np.random.default_rng(1)
-    rho = random.uniform(0.3, 0.7, problem.n_tets)
-    design = held_design(equilibria, rho, problem.X_temp)
-    modes = modes_at(equilibria, design)
-    drho, dc = random.normal(size=problem.n_tets), random.normal(size=(2, 3))
-    expected = drho @ modes.by_density + 0.1 * dc.ravel() @ modes.by_held
-    h = 1e-5
-
-    def moved(sign: float) -> np.ndarray:
-        held = held_positions(equilibria, design.median) + sign * h * 0.1 * dc
-        x, f, y = design.median.x, design.median.forces, design.final.y
-        trial = equilibrate(equilibria, rho + sign * h * drho, held, x, f, y, TIGHT, 40)
-        assert trial is not None
-        return amplitudes(problem, modes, trial, design)
-
-    found = (moved(1.0) - moved(-1.0)) / (2 * h)
-    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
-
-
-def test_the_amplitudes_hold_the_whole_error() -> None:
-    problem = bar(degrees=30.0)
-    equilibria = two_patches(problem)
-    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
-    modes = modes_at(equilibria, design)
-    assert np.linalg.norm(modes.amplitudes) == pytest.approx(shape_error(problem, design.final.y).rms, rel=1e-9)
 
 
 def test_labels_that_were_spoilt_are_made_good_again() -> None:
@@ -143,57 +106,78 @@ def test_a_part_without_smp_is_left_as_it_is() -> None:
 def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
     problem = bar(degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)
-    design = held_design(equilibria, smp.astype(float), problem.X_temp)
-    modes, factors = modes_at(equilibria, design), np.array([0.3, 1.0])
-    chosen = choose_flips(problem, modes, design.rho, factors, FREELY, 30)
-    assert len(chosen)
-    assert at_interface(problem, smp)[chosen].all()
-    assert not smp[chosen].all()
-    full = FlipSettings(FREELY.printable, FREELY.flippable, target_rms=0.0, max_smp_fraction=0.0)
-    assert smp[choose_flips(problem, modes, design.rho, factors, full, 30)].all()
-
-
-def test_whole_flips_are_what_the_held_positions_leave_of_each() -> None:
-    """Of a part of its derivative: the best move of the held positions takes the rest."""
-    problem = bar(cells=(3, 1, 1), degrees=25.0)
-    equilibria, smp = two_patches(problem), upper_half(problem)
-    rho = smp.astype(np.float64)
-    modes = modes_at(equilibria, held_design(equilibria, rho, problem.X_temp))
-    found, error = whole_flips(modes, rho)
-    step = modes.by_density * np.where(smp, -flips.FIRST_FACTORS[1], flips.FIRST_FACTORS[0])[:, None]
-    followed, *_ = np.linalg.lstsq(modes.by_held.T, step.T, rcond=None)
-    left = step - followed.T @ modes.by_held
-    np.testing.assert_allclose(found, left, atol=0.1 * np.abs(left).max())
-    assert np.linalg.norm(error) <= np.linalg.norm(modes.amplitudes) * (1 + 1e-9)
+    found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
+    first = flip(problem, found, smp, smp, FREELY, 1) != smp
+    assert first.sum() == 1
+    assert at_interface(problem, smp)[first].all()
+    assert (flip(problem, found, smp, smp, FREELY, 30) & ~smp).any()
+    full = replace(FREELY, max_smp_fraction=0.0)
+    fewer = flip(problem, found, smp, smp, full, 30)
+    assert (fewer != smp).any()
+    assert smp[fewer].all()
 
 
 def test_flips_that_are_chosen_lower_the_predicted_error() -> None:
     problem = bar(cells=(6, 3, 2), degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)
-    rho = smp.astype(np.float64)
-    modes = modes_at(equilibria, held_design(equilibria, rho, problem.X_temp))
-    change, error = whole_flips(modes, rho)
-    chosen = choose_flips(problem, modes, rho, np.array(flips.FIRST_FACTORS), FREELY, 5)
-    assert np.linalg.norm(error + change[chosen].sum(axis=0)) < np.linalg.norm(error)
+    found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
+    left = [error_left(found, smp, flip(problem, found, smp, smp, FREELY, most)) for most in range(6)]
+    assert left == sorted(left, reverse=True)
+    assert left[0] == pytest.approx(np.linalg.norm(found.residual))
+    assert left[5] < left[0]
+
+
+def test_a_repair_is_made_up_for() -> None:
+    """Tets that were changed by force may be given back, or others changed: the predicted error falls."""
+    problem = bar(cells=(6, 3, 2), degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
+    repair = smp.copy()
+    repair[np.flatnonzero(at_interface(problem, smp))[::5]] ^= True
+    better = compensated(problem, found, smp, repair, FREELY)
+    assert error_left(found, smp, better) < 0.9 * error_left(found, smp, repair)
+
+    def bad(smp: np.ndarray) -> np.ndarray:
+        return ~smp
+
+    np.testing.assert_array_equal(compensated(problem, found, smp, repair, replace(FREELY, printable=bad)), repair)
+
+
+def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same flips are not tried twice where they raised the error."""
+    problem = bar(degrees=30.0)
+    equilibria, tried = two_patches(problem), []
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    smp = design.rho > 0.5
+
+    def worse(at: Equilibria, before: Design, rho: np.ndarray, smallest: float, stay: bool) -> Design:  # noqa: ARG001
+        tried.append(frozenset(np.flatnonzero((rho > 0.5) != smp)))
+        return held_design(equilibria, rho, problem.body.X)
+
+    monkeypatch.setattr(flips, "change_density", worse)
+    monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    assert same is design
+    assert 1 < len(tried) <= flips.MOST_POOR
+    assert len(set(tried)) == len(tried)
 
 
 def test_of_smaller_tets_more_are_flipped_for_less_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the bar's tets were four times as many as usual."""
     problem = bar(cells=(6, 3, 2), degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)
-    rho, factors = smp.astype(np.float64), np.array(flips.FIRST_FACTORS)
-    design = held_design(equilibria, rho, problem.X_temp)
-    modes = modes_at(equilibria, design)
-    monkeypatch.setattr(flips, "LEAST_GAIN", 0.05)
-    few = choose_flips(problem, modes, rho, factors, FREELY, 1000)
+    design = held_design(equilibria, smp.astype(float), problem.X_temp)
+    found = at_all_tets(equilibria, design)
+    monkeypatch.setattr(flips, "LEAST_GAIN", 0.03)
+    few = flip(problem, found, smp, smp, FREELY, 1000) != smp
     asked: list[int] = []
 
     def none_chosen(*args: object) -> np.ndarray:
         asked.append(int(str(args[-1])))
-        return np.zeros(0, np.int64)
+        return smp
 
     monkeypatch.setattr(flips, "USUAL_TETS", problem.n_tets / 4)
-    assert len(choose_flips(problem, modes, rho, factors, FREELY, 1000)) > 2 * len(few)
-    monkeypatch.setattr(flips, "choose_flips", none_chosen)
+    assert (flip(problem, found, smp, smp, FREELY, 1000) != smp).sum() > 1.5 * few.sum()
+    monkeypatch.setattr(flips, "flip", none_chosen)
     polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
     assert asked == [4 * flips.FIRST_BATCH]

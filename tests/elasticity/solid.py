@@ -85,6 +85,12 @@ class Solid:
         kernels.mixed(*self._arguments, u, blocks)
         return blocks
 
+    def element_tangents(self, u: np.ndarray) -> np.ndarray:
+        nn = self.body.elements.shape[1]
+        blocks = np.zeros((len(self.body.elements), nn, nn, 3, 3))
+        kernels.element_tangents(*self._arguments, u, blocks)
+        return blocks
+
     def equilibrium(self, u: np.ndarray, fixed: np.ndarray, load: np.ndarray, steps: int = 1) -> np.ndarray:
         """Displacements in equilibrium with the nodal `load`, the dofs `fixed` as in `u`, reached in load steps."""
         mask = dirichlet_mask(self.pattern, fixed)
