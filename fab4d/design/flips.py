@@ -132,20 +132,26 @@ def flip(
     before : (m,) labels that `found` is about        labels : (m,) to begin with        most : flips
     """
     labels, tets, volumes = labels.copy(), found.tets, problem.volume_fractions
+    corners, pinching = problem.body.elements[tets, :4], np.zeros(len(tets), bool)
     own, least = (found.change**2).sum(axis=1), LEAST_GAIN / fineness(problem)
     residual = found.left((labels != before)[tets])
+    slope, squared = found.change @ residual, float(residual @ residual)
     for _ in range(most):
         sign = np.where((labels != before)[tets], -1.0, 1.0)
         room = settings.max_smp_fraction - volumes @ labels
-        allowed = at_interface(problem, labels)[tets] & (labels[tets] | (volumes[tets] <= room))
-        gain = np.where(allowed, -2 * sign * (found.change @ residual) - own, 0.0)
-        worth = np.flatnonzero(gain > least * (residual @ residual))
-        ranked = worth[np.argsort(-gain[worth])]
-        best = next((k for k in ranked if settings.flippable(labels, int(tets[k]))), None)
-        if best is None:
+        allowed = at_interface(problem, labels)[tets] & (labels[tets] | (volumes[tets] <= room)) & ~pinching
+        gain = np.where(allowed, -2 * sign * slope - own, 0.0)
+        worth = np.flatnonzero(gain > least * squared)
+        for best in worth[np.argsort(-gain[worth])]:
+            if settings.flippable(labels, int(tets[best])):
+                break
+            pinching[best] = True
+        else:
             break
-        residual = residual + sign[best] * found.change[best]
+        slope, squared = slope + sign[best] * found.along(best), squared - float(gain[best])
         labels[tets[best]] = not labels[tets[best]]
+        # Whether a flip pinches something depends on the tets that share a vertex with it.
+        pinching &= ~np.isin(corners, corners[best]).any(axis=1)
     return labels
 
 

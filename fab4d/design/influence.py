@@ -8,6 +8,7 @@ whole part.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -80,6 +81,15 @@ class Influence:
     def left(self, flipped: BoolArray) -> FloatArray:
         """(q,) the error with the tets `flipped` (k,)."""
         return self.residual + self.change[flipped].sum(axis=0)
+
+    @cached_property
+    def overlaps(self) -> FloatArray | None:
+        """(k, k) scalar products of the changes; None where these are shorter than they are many."""
+        return None if len(self.tets) > self.change.shape[1] else self.change @ self.change.T
+
+    def along(self, k: int) -> FloatArray:
+        """(k,) scalar products of all changes with the k-th."""
+        return self.change @ self.change[k] if self.overlaps is None else self.overlaps[k]
 
     def taught(self, flipped: BoolArray, error: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really left the error (q,): what they do together is that.
