@@ -21,6 +21,7 @@ from fab4d.fabrication.wellcomposed import flip_check
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
+from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
 from fab4d.stages._element import element_for
@@ -34,6 +35,7 @@ MOST_FITS = 3
 # that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
+# So they do where the relaxed design is out of reach of the tolerance.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
 Polish = Callable[[Design], Design]
 
@@ -156,7 +158,8 @@ def _flip_settings(
     relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
     down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
-    return replace(settings, rounds=FEW_ROUNDS) if problem.n_tets > MANY_TETS else settings
+    few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * weights.error_scale
+    return replace(settings, rounds=FEW_ROUNDS) if few else settings
 
 
 def _polish(equilibria: Equilibria, weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Polish:

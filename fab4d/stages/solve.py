@@ -45,6 +45,9 @@ FAST_GROWTH = 2.5
 # A coarse mesh is searched from so many times more random points where the usual ones nearly do: what is found there
 # saves steps on all tets, which take minutes.
 MORE_BEGINNINGS = 3
+# Where the tolerance is far out of reach, what so many times the points would leave of the error tells whether points
+# are what is missing.
+MANY_MORE = 4
 # Where the scene names no number of points: those whose relaxed design is at this share of the tolerance, and in later
 # attempts as many times more.
 RELAXED_SHARE = 0.6
@@ -102,7 +105,7 @@ def _designed(
         "attempts": searched.attempts,
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "least_smp": None if least is None else least.trials,
-        "limited_by": _limited_by(problem, profile, searched.found),
+        "limited_by": _limited_by(problem, profile, searched.found, searched.more_points),
         "left_out": LEFT_OUT + searched.left_out,
     }
     return searched.finished or searched.found, searched.relaxed, report
@@ -149,6 +152,14 @@ def _designed_coarse(
     return carried, report | {"left_out": left_out}
 
 
+@dataclass(frozen=True)
+class _MorePoints:
+    """A number of points, and the RMS error, L0, of the relaxed design with them."""
+
+    count: int
+    rms: float
+
+
 @dataclass(frozen=True, eq=False)
 class _Searched:
     """What the attempts came to.
@@ -157,6 +168,7 @@ class _Searched:
     relaxed : the last design before rounding
     printed_rms : RMS error of `found` as printed, L0, inf where it was not judged
     finished : the last relaxed design, rounded in the elements of the last fit
+    more_points : what more points would reach, where these are far from the tolerance
     """
 
     found: Search
@@ -166,6 +178,7 @@ class _Searched:
     printed_rms: float
     finished: Search | None
     left_out: list[dict[str, str]]
+    more_points: _MorePoints | None = None
 
 
 def _finished(
@@ -233,6 +246,7 @@ def _search(
     def settings_of(other: Problem) -> ReducedSettings:
         return search_settings(other, profile, 0, count)
 
+    more_points: _MorePoints | None = None
     starts = Starts(problem, mesh, profile["materials"], settings_of, trace, monitor, most=more_beginnings * BEGINNINGS)
     for attempt in range(first, len(ATTEMPTS)):
         settings = search_settings(problem, profile, attempt, _tried(profile, attempt, count))
@@ -244,6 +258,9 @@ def _search(
             finishes[attempt] = finished = _finished(mesh, profile, element, at, settings, trace)
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
                 return _Searched(at, at, settings, 1, np.inf, finished, [NOT_LINEAR])
+        if attempt == 0 and _asked(profile, settings) and far_off(at, settings):
+            monitor.progress("out of reach", rms_mm=at.relaxed_rms * problem.length, forces=settings.n_points)
+            more_points = _more_points(problem, settings, monitor)
         found = solve_reduced(problem, settings, watch, at)
         if _hopeless(profile, settings, found):
             best = best or found
@@ -260,7 +277,7 @@ def _search(
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
     left_out = [NOT_QUADRATIC] if element == "quadratic" and far_off(last, settings) else []
-    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt), left_out)
+    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt), left_out, more_points)
 
 
 def _rms(found: Search) -> float:
@@ -298,7 +315,23 @@ def _reached(found: Search) -> float:
     return min(found.relaxed_rms, _rms(found))
 
 
-def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> str | None:
+def _more_points(problem: Problem, settings: ReducedSettings, monitor: Monitor) -> _MorePoints | None:
+    """What MANY_MORE times the points would reach; None where no equilibrium is found with them."""
+    many = replace(settings, n_points=MANY_MORE * settings.n_points)
+
+    def watch(at: Search) -> None:
+        monitor.progress("more points", rms_mm=_rms(at) * problem.length, forces=at.equilibria.patches.count)
+
+    try:
+        at = relaxed(problem, many, watch)
+    except EquilibriumError:
+        return None
+    return _MorePoints(at.equilibria.patches.count, at.relaxed_rms)
+
+
+def _limited_by(
+    problem: Problem, profile: Mapping[str, Any], found: Search, more_points: _MorePoints | None = None
+) -> str | None:
     """What keeps the relaxed design, each tet any mixture, from the goal; None where it comes near enough."""
     weights = search_settings(problem, profile).weights
     if _reached(found) <= weights.error_scale:
@@ -318,6 +351,15 @@ def _limited_by(problem: Problem, profile: Mapping[str, Any], found: Search) -> 
     return (
         f"{what}: with any mixture of materials in each tet the error stays at {left:.3g} mm, "
         f"most of all near ({place}) mm of the printed part"
+    ) + ("" if more_points is None else _outlook(problem, weights.error_scale, more_points))
+
+
+def _outlook(problem: Problem, tolerance: float, more: _MorePoints) -> str:
+    left = f"{more.count} points would leave {more.rms * problem.length:.3g} mm"
+    if more.rms <= tolerance:
+        return f"; {left}"
+    return (
+        f"; even {left}: the temporary shape asks for more than pulling at points does, so change it or the tolerance"
     )
 
 

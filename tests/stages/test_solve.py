@@ -1,5 +1,6 @@
 """The stage solve: how many points it takes, and what it says where a goal is out of reach."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +62,26 @@ def test_a_goal_out_of_reach_says_what_limits_it(bar: dict[str, np.ndarray]) -> 
     weak = replace(PROFILE["rig"], max_force=20.0)
     report = solved(bar, Goal(tolerance=0.02, max_forces=1), rig=weak)["solve_report"]
     assert report["limited_by"].startswith("the largest force of the rig")
+
+
+def test_what_more_points_would_leave_is_told_where_the_goal_is_far_off(bar: dict[str, np.ndarray]) -> None:
+    said = solved(bar, Goal(tolerance=0.02, max_forces=1))["solve_report"]["limited_by"]
+    found = re.search(r"stays at ([\d.]+) mm, .*; (even )?4 points would leave ([\d.]+) mm", said)
+    assert found is not None
+    assert float(found[3]) < float(found[1])
+    assert (found[2] is not None) == (float(found[3]) > 0.02) == ("change it or the tolerance" in said)
+    near = solved(bar, Goal(tolerance=float(found[1]) / 1.2, max_forces=1))["solve_report"]["limited_by"]
+    assert near is None or "would leave" not in near
+
+
+@pytest.mark.parametrize(("reached", "enough"), [(0.9, True), (1.1, False)])
+def test_more_points_are_advised_only_where_they_are_enough(
+    bar: dict[str, np.ndarray], reached: float, enough: bool
+) -> None:
+    problem = problem_of(bar, PROFILE["materials"], "linear")
+    said = solve._outlook(problem, 0.01, solve._MorePoints(8, 0.01 * reached))
+    assert "8 points would leave" in said
+    assert ("change it or the tolerance" not in said) == enough
 
 
 def test_a_rig_that_only_pulls_is_named_where_that_limits(bar: dict[str, np.ndarray]) -> None:
