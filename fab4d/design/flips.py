@@ -23,11 +23,11 @@ FIRST_BATCH, LARGEST_BATCH = 40, 200
 # So many tets at the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 500
 # A flip has to lower the predicted squared error by this share of it, a round the objective by this one.
-LEAST_GAIN, LEAST_ROUND_GAIN = 5e-4, 1e-2
+LEAST_GAIN, LEAST_ROUND_GAIN = 5e-4, 2e-2
 # Of more tets than this, in proportion more are flipped at once, each for a smaller gain.
 USUAL_TETS = 5_000
 # So many rounds in a row that gain less end it.
-MOST_POOR = 6
+MOST_POOR = 4
 # Flips whose equilibria are farther away than steps of this share of the change go are given up, and so many times
 # fewer are tried next.
 SMALLEST_STEP, FEWER = 0.25, 3
@@ -50,7 +50,7 @@ class FlipSettings:
     flippable: Flippable
     target_rms: float
     max_smp_fraction: float = 1.0
-    rounds: int = 20
+    rounds: int = 15
 
 
 def polish_labels(

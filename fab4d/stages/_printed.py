@@ -44,10 +44,10 @@ def as_printed(
 ) -> Printed:
     """The design as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
 
-    Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
+    Of few repairs, for this judges many designs. Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
     """
     settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
-    smp = repaired(mesh, printer, settings, found, weights.error_scale).smp
+    smp = repaired(mesh, printer, settings, found, weights.error_scale, more=0).smp
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))
     except EquilibriumError:

@@ -34,11 +34,16 @@ class Repair:
 
 
 def repaired(
-    mesh: Mapping[str, np.ndarray], printer: PrinterCard, settings: FlipSettings, found: Search, error_scale: float
+    mesh: Mapping[str, np.ndarray],
+    printer: PrinterCard,
+    settings: FlipSettings,
+    found: Search,
+    error_scale: float,
+    more: int = MORE_REPAIRS,
 ) -> Repair:
     """The repair of a near 0/1 design that promises the smallest error, SMP within the share that settings allow.
 
-    error_scale : RMS error, L0, that is worth a move of the held positions
+    error_scale : RMS error, L0, that is worth a move of the held positions        more : repairs by random costs
 
     The cost is the tet's volume or how far its flip moves the finished shape: the latter where it promises a clearly
     smaller error, for it turns TPE to SMP rather than SMP to TPE, which moves more.
@@ -58,7 +63,7 @@ def repaired(
 
     least, best = made(by_volume)
     least *= CLEARLY_BETTER
-    for cost in _other_costs(by_volume, flips):
+    for cost in _other_costs(by_volume, flips, more):
         left, other = made(cost)
         if left <= least and volumes[other.smp].sum() <= settings.max_smp_fraction * volumes.sum():
             least, best = left, other
@@ -86,12 +91,13 @@ def _beside(problem: Problem, some: BoolArray) -> BoolArray:
     return result
 
 
-def _other_costs(by_volume: FloatArray, flips: Influence) -> Iterator[FloatArray]:
+def _other_costs(by_volume: FloatArray, flips: Influence, more: int) -> Iterator[FloatArray]:
     moved = np.ones(len(by_volume))
     moved[flips.tets] = np.linalg.norm(flips.change, axis=1)
     moved[flips.tets] /= moved[flips.tets].mean()
     by_influence = VOLUME_SHARE * by_volume + (1 - VOLUME_SHARE) * moved
     yield by_influence
     random = np.random.default_rng(0)
-    for base in (by_influence, by_volume) * (MORE_REPAIRS // 2):
+    for k in range(more):
+        base = by_volume if k % 2 else by_influence
         yield base * np.exp(SPREAD * random.standard_normal(len(base)))

@@ -64,7 +64,7 @@ def test_the_repair_of_the_smallest_predicted_error_is_taken(
 ) -> None:
     """Of two, the second is taken where it promises clearly less."""
     other = by_volume(mesh) * np.random.default_rng(1).lognormal(size=len(mesh["tets"]))
-    monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips: [other])  # noqa: ARG005
+    monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips, more: [other])  # noqa: ARG005
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", 0.0)
     usual = repaired(mesh, PROFILE["printer"], FLIPS, found, SCALE)
     np.testing.assert_allclose(usual.cost, by_volume(mesh))
