@@ -44,7 +44,8 @@ def as_printed(
 ) -> Printed:
     """The design as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
 
-    Of few repairs, for this judges many designs. Flips take long: they are left out up to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
+    The best of few repairs, for this judges many designs. Flips take long: they are left out up to the RMS error
+    `good_enough`, L0, and where they cannot reach the tolerance.
     """
     settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
     smp = repaired(mesh, printer, settings, found, weights.error_scale, more=0).smp
