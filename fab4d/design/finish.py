@@ -81,4 +81,4 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
         held_back = held_back + 1 if hard else 0
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings.undecided_fraction, LAST_SHARE)
+    return decided(at, settings, LAST_SHARE)

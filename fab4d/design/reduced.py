@@ -16,7 +16,7 @@ from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.measures import face_area_vectors
-from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
@@ -36,6 +36,8 @@ DEARER = 0.86
 # So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
 # that are not taken, or taken with the largest damping and less than this share of the undecided tets decided.
 MOST_STUCK, LEAST_DECIDED = 3, 0.02
+# Of what is left then, this share is rounded at a time, or so many tets, with as many tries of a step that follows.
+DECIDED_SHARE, FEWEST_DECIDED, DECIDED_TRIES = 0.5, 4, 3
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -51,6 +53,7 @@ class ReducedSettings:
     factor by which lam_round grows in each step.
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
+    decide_in_steps : whether what rounding leaves undecided is rounded by and by, the rest following
     centers : (n_points,) vertices at which points are held first; None spreads them over the body
     """
 
@@ -63,6 +66,7 @@ class ReducedSettings:
     undecided_fraction: float = 2e-4
     round_growth: float = 1.6
     nearly: float = 1.5
+    decide_in_steps: bool = True
     centers: IntArray | None = None
 
 
@@ -115,7 +119,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
         watch(at)
-    return decided(at, settings.undecided_fraction) or at
+    return decided(at, settings) or at
 
 
 def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
@@ -289,9 +293,7 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Raise lam_round until all but a few densities are 0 or 1, held positions following, or steps come to nothing."""
     too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
     lam_SMP = settings.round_growth**DEARER * at.lam_SMP if too_much else at.lam_SMP
-    # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
-    scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
-    weights = settings.weights.replace(error_scale=scale, lam_SMP=lam_SMP, lam_round=at.lam_round)
+    weights = _rounding_weights(replace(at, lam_SMP=lam_SMP), settings)
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping, stay=at.stay)
     before, left = undecided_fraction(at.design.rho), undecided_fraction(step.design.rho)
     stuck = not step.accepted or (step.damping >= LARGEST_DAMPING and left > (1 - LEAST_DECIDED) * before)
@@ -312,29 +314,61 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     )
 
 
+def _rounding_weights(at: Search, settings: ReducedSettings) -> ObjectiveWeights:
+    # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
+    scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
+    return settings.weights.replace(error_scale=scale, lam_SMP=at.lam_SMP, lam_round=at.lam_round)
+
+
 STEPS = {Phase.RELAX: relax_step, Phase.EXCHANGE: exchange_step, Phase.ROUND: round_step}
 
 
 def undecided_fraction(rho: FloatArray) -> float:
     """Share of tets whose density is neither 0 nor 1."""
-    return float(np.mean((rho > UNDECIDED[0]) & (rho < UNDECIDED[1])))
+    return float(np.mean(_undecided(rho)))
 
 
-def decided(at: Search, undecided: float, most: float = 1.0) -> Search | None:
-    """The state with its densities rounded at once, as it is where that share of the tets or less is `undecided`.
+def _undecided(rho: FloatArray) -> BoolArray:
+    return (rho > UNDECIDED[0]) & (rho < UNDECIDED[1])
+
+
+def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search | None:
+    """The state with all its densities rounded, as it is where the share that `settings` allow or less is undecided.
 
     None where more than the share `most` is left, or no equilibrium holds them.
     """
     left = undecided_fraction(at.design.rho)
-    if left <= undecided:
+    if left <= settings.undecided_fraction:
         return at
     if left > most:
         return None
     try:
-        design = change_density(at.equilibria, at.design, np.round(at.design.rho))
+        design = _decided_by_and_by(at, settings) if settings.decide_in_steps else None
+        design = design or change_density(at.equilibria, at.design, np.round(at.design.rho))
     except EquilibriumError:
         return None
     return replace(at, design=design, phase=Phase.DONE)
+
+
+def _decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
+    """The surest densities rounded first; the others and the held positions make up for it.
+
+    None where there is no equilibrium on the way.
+    """
+    equilibria, design, damping = at.equilibria, at.design, at.damping
+    weights, L = _rounding_weights(at, settings).replace(lam_round=0.0), smoothness_matrix(equilibria.problem)
+    while (left := np.flatnonzero(_undecided(design.rho))).size:
+        count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED)
+        sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
+        rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
+        rho[sure], movable[unsure] = np.round(rho[sure]), True
+        try:
+            design = change_density(equilibria, design, rho)
+        except EquilibriumError:
+            return None
+        step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
+        design, damping = step.design, min(step.damping, LARGEST_DAMPING)
+    return change_density(equilibria, design, np.round(design.rho))
 
 
 # -- refit

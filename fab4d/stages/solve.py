@@ -406,7 +406,8 @@ def search_settings(
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )
-    return replace(settings, round_growth=FAST_GROWTH, nearly=1.0) if problem.n_tets > MANY_TETS else settings
+    fast = replace(settings, round_growth=FAST_GROWTH, nearly=1.0, decide_in_steps=False)
+    return fast if problem.n_tets > MANY_TETS else settings
 
 
 def _artifacts(
