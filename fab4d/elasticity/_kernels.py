@@ -151,6 +151,16 @@ def _tangent_scalars(jm1, e, mu, kappa, w):
     )
 
 
+@njit(cache=True, inline="always")
+def _tangent_block(na, nb, f, g, a, b, s0, s1, s2, s3, block):
+    """block (3, 3): the tangent between the nodes a and b, whose shape functions have the gradients na and nb."""
+    dot = s0 * (na[0] * nb[0] + na[1] * nb[1] + na[2] * nb[2])
+    for i in range(3):
+        for k in range(3):
+            block[i, k] = s1 * (f[b, k] * g[a, i] + g[b, k] * f[a, i]) + s2 * g[a, i] * g[b, k] + s3 * g[b, i] * g[a, k]
+        block[i, i] += dot
+
+
 @njit(cache=True)
 def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
     """Adds the tangent stiffness to `data`, the lower triangle in the CSC form of pattern.SymmetricPattern."""
@@ -197,7 +207,7 @@ def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
 def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
     """Adds the tangent stiffness of each element to blocks (m, nn, nn, 3, 3): d(force on a)/d(position of b)."""
     nn = elements.shape[1]
-    H, C = np.zeros((3, 3)), np.zeros((3, 3))
+    H, C, block = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     f, g = np.zeros((nn, 3)), np.zeros((nn, 3))
     for m in range(elements.shape[0]):
         for q in range(dN.shape[1]):
@@ -207,19 +217,10 @@ def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
             s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], weights[m, q])
             for a in range(nn):
                 for b in range(nn):
-                    dot = s0 * (
-                        dN[m, q, a, 0] * dN[m, q, b, 0]
-                        + dN[m, q, a, 1] * dN[m, q, b, 1]
-                        + dN[m, q, a, 2] * dN[m, q, b, 2]
-                    )
+                    _tangent_block(dN[m, q, a], dN[m, q, b], f, g, a, b, s0, s1, s2, s3, block)
                     for i in range(3):
                         for k in range(3):
-                            blocks[m, a, b, i, k] += (
-                                s1 * (f[b, k] * g[a, i] + g[b, k] * f[a, i])
-                                + s2 * g[a, i] * g[b, k]
-                                + s3 * g[b, i] * g[a, k]
-                            )
-                        blocks[m, a, b, i, i] += dot
+                            blocks[m, a, b, i, k] += block[i, k]
 
 
 @njit(cache=True)
@@ -389,21 +390,9 @@ def mixed(elements, dN, weights, mu, kappa, u, blocks):
             s0, s1, s2, s3 = _tangent_scalars(jm1, e, mu[m], kappa[m], w)
             for a in range(nn):
                 for b in range(nn):
-                    dot = s0 * (
-                        dN[m, q, a, 0] * dN[m, q, b, 0]
-                        + dN[m, q, a, 1] * dN[m, q, b, 1]
-                        + dN[m, q, a, 2] * dN[m, q, b, 2]
-                    )
+                    _tangent_block(dN[m, q, a], dN[m, q, b], f, g, a, b, s0, s1, s2, s3, block)
                     for i in range(3):
                         Pg[i] = w * (P[i, 0] * dN[m, q, b, 0] + P[i, 1] * dN[m, q, b, 1] + P[i, 2] * dN[m, q, b, 2])
-                        for k in range(3):
-                            block[i, k] = (
-                                s1 * (f[b, k] * g[a, i] + g[b, k] * f[a, i])
-                                + s2 * g[a, i] * g[b, k]
-                                + s3 * g[b, i] * g[a, k]
-                            )
-                        block[i, i] += dot
-                    for i in range(3):
                         for k in range(3):
                             blocks[m, a, b, i, k] -= (
                                 block[i, k]
