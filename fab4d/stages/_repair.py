@@ -21,7 +21,7 @@ VOLUME_SHARE = 0.1
 # A repair by another cost than the volume has to leave at most this share of the error predicted for that one.
 CLEARLY_BETTER = 0.96
 # The search for a repair ends at one of many, by which of equal costs comes first: so many more are made, each with
-# costs that are off by a random factor of this standard deviation of its logarithm.
+# costs that are off by a random factor of this standard deviation of its logarithm; few where each takes long.
 MORE_REPAIRS, SPREAD = 4, 0.5
 
 

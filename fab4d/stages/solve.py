@@ -21,7 +21,7 @@ from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed
-from fab4d.stages._repair import repaired
+from fab4d.stages._repair import MORE_REPAIRS, repaired
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages._starts import Starts
 from fab4d.stages.monitor import Monitor, Prefixed
@@ -416,9 +416,10 @@ def _artifacts(
     problem, design = found.equilibria.problem, found.design
     error_scale = search_settings(problem, profile).weights.error_scale
     flips = flip_settings(mesh, profile["printer"], profile["goal"], error_scale)
+    more = 0 if problem.n_tets > MANY_TETS else MORE_REPAIRS
     relaxed = {
         "rho": design.rho,
-        "repair_cost": repaired(mesh, profile["printer"], flips, found, error_scale).cost,
+        "repair_cost": repaired(mesh, profile["printer"], flips, found, error_scale, more).cost,
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),
