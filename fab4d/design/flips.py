@@ -22,12 +22,12 @@ from fab4d.mesh.tetmesh import BoolArray
 FIRST_BATCH, LARGEST_BATCH = 40, 200
 # So many tets at the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 500
-# A flip has to lower the predicted squared error by this share of it, a round the objective by this one.
+# A flip has to lower the predicted squared error by this share of it, a round by this one, and so the objective.
 LEAST_GAIN, LEAST_ROUND_GAIN = 5e-4, 2e-2
 # Of more tets than this, in proportion more are flipped at once, each for a smaller gain.
 USUAL_TETS = 5_000
 # So many rounds in a row that gain less end it.
-MOST_POOR = 4
+MOST_POOR = 3
 # Flips whose equilibria are farther away than steps of this share of the change go are given up, and so many times
 # fewer are tried next.
 SMALLEST_STEP, FEWER = 0.25, 3
@@ -76,7 +76,7 @@ def polish_labels(
             found = influence(equilibria, design, tets, weights.error_scale, int(MOST_CANDIDATES * finer))
         flipped = settings.printable(flip(problem, found, smp, smp, settings, batch))
         made = int((flipped != smp).sum())
-        if not made:
+        if error_left(found, smp, flipped) ** 2 > (1 - LEAST_ROUND_GAIN) * float(found.residual @ found.residual):
             break
         trial = _changed(equilibria, design, flipped)
         if trial is None:

@@ -37,6 +37,8 @@ ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
 # So they do where the relaxed design is out of reach of the tolerance.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
+# Printed labels are compared after so many steps of the held positions.
+FEW_STEPS = 3
 Polish = Callable[[Design], Design]
 
 
@@ -89,22 +91,38 @@ def _printed_design(
     """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
 
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
-    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair.
+    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair,
+    if the equilibria agree.
     """
     design = None
     if equilibria.problem.n_tets > MANY_TETS:
         design = _carried(equilibria, relaxed, smp.astype(np.float64))
     if design is not None:
         return design
-    before = _relaxed_design(equilibria, relaxed)
+    before, wanted = _relaxed_design(equilibria, relaxed), [smp]
     flips = influence_near(equilibria, before, smp, weights.error_scale)
     if flips is not None:
-        smp = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
-    rho = smp.astype(np.float64)
-    try:
-        return change_density(equilibria, before, rho)
-    except EquilibriumError:
+        better = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
+        wanted += [better] if (better != smp).any() else []
+    found = [each for labels in wanted if (each := _followed(equilibria, before, labels)) is not None]
+    if not found:
+        rho = smp.astype(np.float64)
         return _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
+    return found[0] if len(found) == 1 else min(found, key=lambda each: _fitted_rms(equilibria, each, weights))
+
+
+def _followed(equilibria: Equilibria, before: Design, smp: BoolArray) -> Design | None:
+    """The labels smp (m,) at the held positions of another design; None where no path of equilibria leads there."""
+    try:
+        return change_density(equilibria, before, smp.astype(np.float64))
+    except EquilibriumError:
+        return None
+
+
+def _fitted_rms(equilibria: Equilibria, design: Design, weights: ObjectiveWeights) -> float:
+    """The RMS error, L0, after some steps of the held positions: before them it tells little."""
+    fitted = refit(equilibria, design, weights, lambda at: None, iterations=FEW_STEPS)  # noqa: ARG005
+    return shape_error(equilibria.problem, fitted.final.y).rms
 
 
 def _programmed(done: Programming, smp: FloatArray) -> Design:
