@@ -124,7 +124,10 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
     assert usual.nearly > fast.nearly == 1.0
-    assert vars(replace(fast, round_growth=usual.round_growth, nearly=usual.nearly)) == vars(usual)
+    assert usual.decide_in_steps > fast.decide_in_steps
+    assert vars(replace(fast, round_growth=usual.round_growth, nearly=usual.nearly, decide_in_steps=True)) == vars(
+        usual
+    )
 
 
 def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
