@@ -9,7 +9,6 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings, at_interface, compensated, error_left
 from fab4d.design.gauss_newton import Design
 from fab4d.design.influence import Influence, influence
-from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search
 from fab4d.io.scene import PrinterCard
 from fab4d.mesh.measures import tet_volumes
@@ -20,6 +19,8 @@ from fab4d.stages.threshold import labels_for
 VOLUME_SHARE = 0.1
 # A repair by another cost than the volume has to leave at most this share of the error predicted for that one.
 CLEARLY_BETTER = 0.96
+# What tets away from the interface do is not known: they cost so many times more than the average of the others.
+UNSEEN = 5.0
 # The search for a repair ends at one of many, by which of equal costs comes first: so many more are made, each with
 # costs that are off by a random factor of this standard deviation of its logarithm; few where each takes long.
 MORE_REPAIRS, SPREAD = 4, 0.5
@@ -56,8 +57,13 @@ def repaired(
     if flips is None or not flips.change.any():
         return Repair(by_volume, usual)
 
+    unseen = np.ones(len(tets), bool)
+    unseen[flips.tets] = False
+
     def made(cost: FloatArray) -> tuple[float, Repair]:
         smp = labels_for(X, tets, rho, cost, printer).smp
+        if (smp != before)[unseen].any():
+            return np.inf, Repair(cost, smp)
         smp = compensated(problem, flips, before, smp, settings)
         return error_left(flips, before, smp), Repair(cost, smp)
 
@@ -71,30 +77,21 @@ def repaired(
 
 
 def influence_near(equilibria: Equilibria, design: Design, smp: BoolArray, error_scale: float) -> Influence | None:
-    """What flips do of the tets that labels smp (m,) change in a near 0/1 design, and of those beside an interface.
+    """What flips do of the tets that labels smp (m,) change in a near 0/1 design, and of those at an interface.
 
     None where there are none, or no points whose forces could change.
     """
     problem, before = equilibria.problem, design.rho > 0.5
-    near = _beside(problem, at_interface(problem, smp) | at_interface(problem, before)) | (smp != before)
+    near = at_interface(problem, smp) | at_interface(problem, before) | (smp != before)
     if not equilibria.patches.count or not near.any():
         return None
     return influence(equilibria, design, np.flatnonzero(near), error_scale)
 
 
-def _beside(problem: Problem, some: BoolArray) -> BoolArray:
-    """(m,) tets of `some` (m,) and their neighbours."""
-    first, second = problem.neighbours.T
-    result = some.copy()
-    result[first[some[second]]] = True
-    result[second[some[first]]] = True
-    return result
-
-
 def _other_costs(by_volume: FloatArray, flips: Influence, more: int) -> Iterator[FloatArray]:
-    moved = np.ones(len(by_volume))
-    moved[flips.tets] = np.linalg.norm(flips.change, axis=1)
-    moved[flips.tets] /= moved[flips.tets].mean()
+    known = np.linalg.norm(flips.change, axis=1)
+    moved = np.full(len(by_volume), UNSEEN)
+    moved[flips.tets] = known / known.mean()
     by_influence = VOLUME_SHARE * by_volume + (1 - VOLUME_SHARE) * moved
     yield by_influence
     random = np.random.default_rng(0)

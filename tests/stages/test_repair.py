@@ -8,7 +8,7 @@ import pytest
 from bent_bar import PROFILE, bent_bar
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.flips import FlipSettings, error_left
+from fab4d.design.flips import FlipSettings, at_interface, error_left
 from fab4d.design.gauss_newton import equilibrate
 from fab4d.design.influence import influence
 from fab4d.design.patches import build_patches, spread_centers
@@ -63,7 +63,8 @@ def test_the_repair_of_the_smallest_predicted_error_is_taken(
     mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of two, the second is taken where it promises clearly less."""
-    other = by_volume(mesh) * np.random.default_rng(1).lognormal(size=len(mesh["tets"]))
+    away = ~at_interface(found.equilibria.problem, found.design.rho > 0.5)
+    other = by_volume(mesh) * np.random.default_rng(1).lognormal(size=len(mesh["tets"])) * np.where(away, 1e3, 1.0)
     monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips, more: [other])  # noqa: ARG005
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", 0.0)
     usual = repaired(mesh, PROFILE["printer"], FLIPS, found, SCALE)
@@ -75,6 +76,28 @@ def test_the_repair_of_the_smallest_predicted_error_is_taken(
     for limit, expected in ((1.01 * ratio, second), (0.99 * ratio, usual)):
         monkeypatch.setattr(_repair, "CLEARLY_BETTER", limit)
         np.testing.assert_array_equal(repaired(mesh, PROFILE["printer"], FLIPS, found, SCALE).cost, expected.cost)
+
+
+def test_no_repair_is_taken_whose_influence_is_not_known(
+    mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside = np.flatnonzero(~at_interface(found.equilibria.problem, found.design.rho > 0.5))
+    assert len(inside)
+    usual = labels_for
+
+    def deep(X: Any, tets: Any, rho: Any, cost: Any, printer: Any) -> Any:
+        made = usual(X, tets, rho, cost, printer)
+        if cost[0] != -1.0:
+            return made
+        smp = made.smp.copy()
+        smp[inside] = ~smp[inside]
+        return replace(made, smp=smp)
+
+    marked = np.r_[-1.0, by_volume(mesh)[1:]]
+    monkeypatch.setattr(_repair, "labels_for", deep)
+    monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips, more: [marked])  # noqa: ARG005
+    monkeypatch.setattr(_repair, "CLEARLY_BETTER", 1e9)
+    np.testing.assert_allclose(repaired(mesh, PROFILE["printer"], FLIPS, found, SCALE).cost, by_volume(mesh))
 
 
 def test_a_repair_is_made_up_for(mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch) -> None:
