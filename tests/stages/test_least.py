@@ -58,7 +58,7 @@ def test_the_least_smp_that_is_acceptable_is_taken(scene: Scene, checked: dict[s
     assert [trial["lam_SMP"] / trials[0]["lam_SMP"] for trial in trials[:2]] == [1, 2]
     assert len(acceptable) > 1  # else there is nothing to choose from
     best = min(acceptable, key=lambda trial: trial["smp_fraction"])
-    assert best["smp_fraction"] < 0.7 * trials[0]["smp_fraction"]
+    assert best["smp_fraction"] < 0.8 * trials[0]["smp_fraction"]
     assert best["rms_mm"] <= 0.9 * scene.goal.tolerance
     assert searched[0]["solve_report"]["printed_rms_mm"] == best["rms_mm"]
     rho = searched[0]["relaxed"]["rho"]
@@ -68,7 +68,7 @@ def test_the_least_smp_that_is_acceptable_is_taken(scene: Scene, checked: dict[s
     delivered = volumes @ rho / volumes.sum()
     # It is rounded in other elements than the trials, whose labels are repaired.
     assert min(trials, key=lambda trial: abs(trial["smp_fraction"] - delivered)) is best
-    assert delivered < 0.7 * trials[0]["smp_fraction"]
+    assert delivered < 0.8 * trials[0]["smp_fraction"]
 
 
 def test_what_is_not_acceptable_says_why(searched: Searched) -> None:
