@@ -76,7 +76,7 @@ def polish_labels(
             found = influence(equilibria, design, tets, weights.error_scale, int(MOST_CANDIDATES * finer))
         flipped = settings.printable(flip(problem, found, smp, smp, settings, batch))
         made = int((flipped != smp).sum())
-        if error_left(found, smp, flipped) ** 2 > (1 - LEAST_ROUND_GAIN) * float(found.residual @ found.residual):
+        if error_left(found, smp, flipped) ** 2 >= (1 - LEAST_ROUND_GAIN) * float(found.residual @ found.residual):
             break
         trial = _changed(equilibria, design, flipped)
         if trial is None:
