@@ -201,10 +201,11 @@ class Equilibria:
         max_iterations: int = 25,
         extra: FloatArray | None = None,
         stay: bool = False,
+        near: Factor | None = None,
     ) -> Median:
         """Median shape with the patch means at `held` (K, 3), from the guess x, forces.
 
-        extra : (N, 3) additional nodal forces on the part, for load paths        stay : see `newton`
+        extra : (N, 3) additional nodal forces on the part, for load paths        stay, near : see `newton`
         The tolerance is relative to the largest nodal element force.
         """
         n, shape = 3 * self.problem.n_nodes, x.shape
@@ -234,7 +235,7 @@ class Equilibria:
 
         z = np.concatenate([x.ravel(), forces.ravel()])
         solution = newton(
-            residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count, advance, stay
+            residual, factor, z, tolerance, max_iterations, fallback, 3 * self.patches.count, advance, stay, near
         )
         x = solution.z[:n].reshape(shape)
         gradients = np.zeros_like(self.problem.body.dN)
@@ -287,12 +288,13 @@ class Equilibria:
         max_iterations: int = 25,
         unloaded: float = 1.0,
         stay: bool = False,
+        near: Factor | None = None,
     ) -> Final:
         """Final shape after unloading, from the guess y.
 
         tolerance : relative to the TPE's pull at the median shape
         unloaded : share of the TPE that pulls back, less than 1 on the way from the median shape
-        stay : see `newton`
+        stay, near : see `newton`
         """
         shape, body, tpe = y.shape, self.problem.body, self.problem.tpe
         pull = np.zeros_like(y)
@@ -319,5 +321,5 @@ class Equilibria:
         def fallback(z: FloatArray) -> Factor:
             return pinned(z, True)
 
-        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0, advance, stay)
+        solution = newton(residual, factor, y.ravel(), tolerance, max_iterations, fallback, 0, advance, stay, near)
         return Final(solution.z.reshape(shape), solution)

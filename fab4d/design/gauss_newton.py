@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array, vstack
 
-from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median, Pinned
 from fab4d.design.objective import (
     DensityTerms,
     ObjectiveWeights,
@@ -46,18 +46,20 @@ def equilibrate(
     tolerance: float = SEARCH_TOLERANCE,
     max_iterations: int = 12,
     stay: bool = False,
+    near: Linearisation | None = None,
 ) -> Design | None:
     """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found.
 
     Where the median shape is found moves from its guess, the guess of the final shape moves along: what stiff SMP has
-    frozen would else be bent in it.
+    frozen would else be bent in it. near : about a design near this one
     """
-    median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay)
+    hot, cold = (None, None) if near is None else (near.held, Pinned(near.free, near.free_fixed))
+    median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay, near=hot)
     if not median.solution.converged:
         return None
     turning = equilibria.free_turning
     y = _ahead(turning.step, y, median.x - x, lambda y: equilibria.final_gradient(rho, median, y)[1])
-    final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay)
+    final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay, near=cold)
     return Design(rho, median, final) if final.solution.converged else None
 
 
@@ -304,7 +306,8 @@ def _trial(
     x0 = _ahead(equilibria.held_turning.step, median.x, dx, lambda x: equilibria.median_gradient(rho, x)[1])
     y0 = _ahead(equilibria.free_turning.step, y, dy, lambda y: equilibria.final_gradient(rho, median, y)[1])
     most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
-    return equilibrate(equilibria, rho, held, x0, median.forces + df, y0, max_iterations=most, stay=stay)
+    forces = median.forces + df
+    return equilibrate(equilibria, rho, held, x0, forces, y0, max_iterations=most, stay=stay, near=model.lin)
 
 
 def _ahead(

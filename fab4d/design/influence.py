@@ -6,9 +6,9 @@ other nodes stay where they are: a small dense system. The forces that it then e
 whole part.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -24,6 +24,7 @@ from fab4d.elasticity import _kernels as kernels
 from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+from fab4d.solvers.threads import side_by_side
 
 # The nodes around a tet give way too, which leaves about this share of what it does among fixed ones.
 SHARE_LEFT = 0.8
@@ -146,7 +147,8 @@ def influence(
 
 # -- from loads to shapes
 
-Loads = Iterator[tuple[slice, csc_array, csc_array]]
+# Each computes forces of some tets, and where these tets are among all.
+Loads = list[Callable[[], tuple[slice, csc_array, csc_array]]]
 
 
 def _on_the_surface(
@@ -154,10 +156,14 @@ def _on_the_surface(
 ) -> tuple[FloatArray, FloatArray]:
     """Change (k, s) by each flip and derivative (3K, s) by the held positions of the weighted boundary positions."""
     change = np.zeros((n_tets, len(on_surface)))
-    for part, hot, cold in loads:
+
+    def follow(load: Callable[[], tuple[slice, csc_array, csc_array]]) -> None:
+        part, hot, cold = load()
         held = np.zeros((3 * lin.n_patches, hot.shape[1]))
         _, dy = lin.respond(-np.vstack([hot.toarray(), held]), -cold.toarray())
         change[part] = (root[:, None] * dy[on_surface]).T
+
+    side_by_side([partial(follow, load) for load in loads], lin.M.shape[0])
     by_held = (root[:, None] * lin.held_columns()[2][on_surface]).T
     return _measured(change, rigid, None), _measured(by_held, rigid, None)
 
@@ -167,7 +173,8 @@ def _in_modes(lin: Linearisation, loads: Loads, n_tets: int, directions: FloatAr
     n = len(directions)
     of_median, of_final = lin.adjoint_states(directions)
     change = np.zeros((n_tets, directions.shape[1]))
-    for part, hot, cold in loads:
+    for load in loads:
+        part, hot, cold = load()
         change[part] = -(hot.T @ of_median[:n] + cold.T @ of_final)
     return change, -of_median[n:]
 
@@ -214,15 +221,18 @@ def _loads(equilibria: Equilibria, design: Design, lin: Linearisation, tets: Int
     hot_tangent = equilibria.median_tangent(design.rho, design.median.x)
     cold_tangent = equilibria.final_tangent(design.rho, design.median, design.final.y)
     cold_mask = equilibria.free_mask(design.final.y)
-    for first in range(0, len(tets), AT_ONCE):
-        part = slice(first, min(first + AT_ONCE, len(tets)))
+
+    def load(part: slice) -> tuple[slice, csc_array, csc_array]:
         some = tets[part]
         around_hot = _compliance(equilibria.held_pattern, hot_tangent, equilibria.held_mask, equilibria, some)
         around_cold = _compliance(equilibria.free_pattern, cold_tangent, cold_mask, equilibria, some)
         mixed = _between_nodes(equilibria, lin, some)
         hot, cold = flip_forces(equilibria, design, some, around_hot, around_cold, mixed)
         elements, n_nodes = problem.body.elements[some], problem.n_nodes
-        yield part, force_columns(elements, hot, n_nodes), force_columns(elements, cold, n_nodes)
+        return part, force_columns(elements, hot, n_nodes), force_columns(elements, cold, n_nodes)
+
+    firsts = range(0, len(tets), AT_ONCE)
+    return [partial(load, slice(first, min(first + AT_ONCE, len(tets)))) for first in firsts]
 
 
 def flip_forces(

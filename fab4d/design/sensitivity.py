@@ -10,6 +10,7 @@ from fab4d.elasticity import _kernels as kernels
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import FloatArray, IntArray
 from fab4d.solvers.linear import Factor
+from fab4d.solvers.threads import side_by_side
 
 
 def _element_forces(equilibria: Equilibria, gradients: FloatArray, moduli: Moduli, u: FloatArray) -> FloatArray:
@@ -148,11 +149,16 @@ class Linearisation:
 def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Final) -> Linearisation:
     """Factor both tangents at the equilibria and form their derivatives with respect to rho and x."""
     problem = equilibria.problem
-    held = equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x))
-    free = equilibria.free_analysis.factor(equilibria.final_tangent(rho, median, final.y))
+    held, free, M = side_by_side(
+        [
+            lambda: equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x)),
+            lambda: equilibria.free_analysis.factor(equilibria.final_tangent(rho, median, final.y)),
+            lambda: _mixed_matrix(equilibria, rho, median, final.y),
+        ],
+        3 * problem.n_nodes,
+    )
     body = problem.body
     hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
-    M = _mixed_matrix(equilibria, rho, median, final.y)
     cold = _element_forces(equilibria, median.gradients, problem.glassy, final.y - median.x)
     by_hot = _element_forces(equilibria, body.dN, hot, median.x - body.X)
     by_cold = cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X)

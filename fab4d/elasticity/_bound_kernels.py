@@ -41,7 +41,7 @@ def _may_stretch(H, largest_stretch):
     return square > largest_stretch * largest_stretch
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bound_gradient(elements, dN, weights, u, largest_stretch, smallest_det, g):
     """Sum of weights / 2 * excess^2 over det F and the three principal stretches; adds its derivative to g (N, 3).
 
@@ -66,7 +66,7 @@ def bound_gradient(elements, dN, weights, u, largest_stretch, smallest_det, g):
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _scatter_outer(n, w, nodes, rank, indptr, data):
     """Adds w n n^T to the lower triangle in the CSC form of pattern.SymmetricPattern."""
     pair = 0
@@ -86,7 +86,7 @@ def _scatter_outer(n, w, nodes, rank, indptr, data):
             pair += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rotating_modes(U, V, sigma, squeeze, smallest_det, largest_stretch, dN, w, nodes, n, rank, indptr, data):
     """Adds the curvature of the excesses where the singular frame turns: skew and symmetric modes of each pair.
 
@@ -113,7 +113,7 @@ def _rotating_modes(U, V, sigma, squeeze, smallest_det, largest_stretch, dN, w, 
                 _scatter_outer(n, 0.5 * w * value, nodes, rank, indptr, data)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bound_tangent(elements, dN, weights, u, largest_stretch, smallest_det, rank, indptr, data):
     """Adds the Hessian of `bound_gradient` without its negative parts, positive semidefinite, to `data`."""
     H, C, A = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))

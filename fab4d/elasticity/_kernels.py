@@ -69,7 +69,7 @@ def _stress(H, C, jm1, e, mu, kappa, P):
         P[i, i] += m * (jm1 - e) + kappa * jm1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def energy(elements, dN, weights, mu, kappa, u):
     """Strain energy and the smallest det F; (inf, det F) as soon as an element is inverted."""
     H, C = np.zeros((3, 3)), np.zeros((3, 3))
@@ -87,7 +87,7 @@ def energy(elements, dN, weights, mu, kappa, u):
     return total, smallest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def gradient(elements, dN, weights, mu, kappa, u, g):
     """Adds the nodal forces dW/du to g (N, 3); returns as `energy`."""
     H, C, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
@@ -111,7 +111,7 @@ def gradient(elements, dN, weights, mu, kappa, u, g):
     return total, smallest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def element_forces(elements, dN, weights, mu, kappa, u, out):
     """Adds the nodal forces of each element to out (m, nn, 3); all elements must have det F > 0."""
     H, C, P = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
@@ -161,7 +161,7 @@ def _tangent_block(na, nb, f, g, a, b, s0, s1, s2, s3, block):
         block[i, i] += dot
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
     """Adds the tangent stiffness to `data`, the lower triangle in the CSC form of pattern.SymmetricPattern."""
     nn = elements.shape[1]
@@ -203,7 +203,7 @@ def tangent(elements, dN, weights, mu, kappa, u, rank, indptr, data):
                     pair += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
     """Adds the tangent stiffness of each element to blocks (m, nn, nn, 3, 3): d(force on a)/d(position of b)."""
     nn = elements.shape[1]
@@ -223,7 +223,7 @@ def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
                             blocks[m, a, b, i, k] += block[i, k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def gather_blocks(elements, rank, indptr, data, blocks):
     """Copies what a matrix that `tangent` assembled has between the nodes of each element: (m, nn, nn, 3, 3)."""
     nn = elements.shape[1]
@@ -244,7 +244,7 @@ def gather_blocks(elements, rank, indptr, data, blocks):
                 pair += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _eigen_symmetric(A, V):
     """Cyclic Jacobi: eigenvectors of A (3, 3) as columns of V; A is overwritten, eigenvalues on its diagonal."""
     for i in range(3):
@@ -269,7 +269,7 @@ def _eigen_symmetric(A, V):
                     A[p, k], A[q, k] = c * A[p, k] - s * A[q, k], s * A[p, k] + c * A[q, k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _singular_frame(H, A, U, V, sigma):
     """F = I + H = U diag(sigma) V^T; A (3, 3) is scratch."""
     for i in range(3):
@@ -286,7 +286,7 @@ def _singular_frame(H, A, U, V, sigma):
             U[i, k] /= sigma[k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _positive_part(sigma, s0, s1, s2, s3, A, V, scaling, same, swapped):
     """Eigenvalues of dP/dF below zero set to zero, in the singular frame of F.
 
@@ -308,7 +308,7 @@ def _positive_part(sigma, s0, s1, s2, s3, A, V, scaling, same, swapped):
                 scaling[i, k] += V[i, j] * max(A[j, j], 0.0) * V[k, j]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _frame_block(na, nb, scaling, same, swapped, block):
     """block_ik = sum_jl T_ijkl na_j nb_l for the projected tangent T of `_positive_part`."""
     for i in range(3):
@@ -319,7 +319,7 @@ def _frame_block(na, nb, scaling, same, swapped, block):
         block[i, i] = scaling[i, i] * na[i] * nb[i] + same[i, j] * na[j] * nb[j] + same[i, l] * na[l] * nb[l]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _scatter_rotated(U, block, column, r, indptr, data):
     """Adds U block U^T as the r-th block below the diagonal of three columns, or on the diagonal (r < 0)."""
     for k in range(3):
@@ -333,7 +333,7 @@ def _scatter_rotated(U, block, column, r, indptr, data):
                     data[base + i] += U[i, p] * block[p, q] * U[k, q]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def tangent_spd(elements, dN, weights, mu, kappa, u, rank, indptr, data):
     """As `tangent`, with dP/dF of each quadrature point replaced by its positive semidefinite part.
 
@@ -367,7 +367,7 @@ def tangent_spd(elements, dN, weights, mu, kappa, u, rank, indptr, data):
                     pair += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mixed(elements, dN, weights, mu, kappa, u, blocks):
     """Adds d(nodal forces)/dx of the glassy term to blocks (m, nn, nn, 3, 3); dN belongs to x, and u = y - x.
 
@@ -403,7 +403,7 @@ def mixed(elements, dN, weights, mu, kappa, u, blocks):
                             )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def deformed_gradients(elements, dN, u, out):
     """Shape-function gradients with respect to the deformed shape, out (m, nq, nn, 3) = F^-T dN; returns min det F."""
     H, C = np.zeros((3, 3)), np.zeros((3, 3))
@@ -421,7 +421,7 @@ def deformed_gradients(elements, dN, u, out):
     return smallest
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def turning_load(elements, dN, weights, u, du, load):
     """Adds to load (N, 3) the right-hand side whose Poisson solution makes the step du turn elements, not shear them.
 

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def regularised_energy(y, tets, gradients, shares, epsilon, gradient):
     """Sum of shares * [ tr(F^T F) / chi^(2/3) + (D^2 + 1) / chi ]; adds its derivative by y (n, 3) to `gradient`.
 

@@ -15,7 +15,9 @@ from scipy.sparse.linalg import splu
 
 from fab4d.errors import MissingToolError
 from fab4d.mesh.tetmesh import FloatArray, IntArray
+from fab4d.solvers._row_kernels import largest_entries
 from fab4d.solvers.nested_dissection import nested_dissection
+from fab4d.solvers.threads import THREADED_FROM, usable_cores
 
 BACKENDS = ("rslab", "splu")
 # Forces one backend where the caller of `analyse` names none.
@@ -29,9 +31,6 @@ REFINE_ABOVE = 1e-14
 MAX_REFINEMENTS = 5
 # Relative to its own compliance, how far rslab's factor lets a constraint give before refinement.
 CONSTRAINT_SOFTNESS = 1e-6
-# Below so many unknowns rslab's threads gain a tenth on an idle machine and lose several times that on a busy one, for
-# they wait actively.
-THREADED_FROM = 50_000
 # A factor whose refined solutions stay above both, relative to |A| |x| + |b| and to |b|, hides vanishing pivots.
 UNUSABLE_ABOVE, UNSOLVED_ABOVE = 1e-12, 1e-6
 
@@ -65,12 +64,6 @@ class Analysis(Protocol):
 
 class SingularMatrixError(ArithmeticError):
     """A pivot vanished: the matrix has no inverse."""
-
-
-def usable_cores() -> int:
-    """The cores that this process may run on, where the system says so, or else all."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
 
 
 def analyse(indptr: IntArray, indices: IntArray, backend: str | None = None) -> Analysis:
@@ -126,26 +119,19 @@ def _check_structure(indptr: IntArray, indices: IntArray) -> None:
         raise ValueError(msg)
 
 
-class _Scaling:
-    """Row scales s = max_j |A_ij|^(1/2) of a symmetric matrix given by its lower triangle."""
+def _scaling(indptr: IntArray, indices: IntArray, data: FloatArray) -> FloatArray:
+    """Row scales s (n,) = max_j |A_ij|^(1/2) of a symmetric matrix given by its lower triangle.
 
-    def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        self._columns = indptr[:-1]
-        self._by_row = np.argsort(indices, kind="stable")
-        self._rows = np.searchsorted(indices[self._by_row], np.arange(len(indptr) - 1))
-
-    def __call__(self, data: FloatArray) -> FloatArray:
-        """s (n,); raises SingularMatrixError for an empty row or an entry that is not finite."""
-        size = np.abs(data)
-        in_column = np.maximum.reduceat(size, self._columns)
-        in_row = np.maximum.reduceat(size[self._by_row], self._rows)
-        largest = np.maximum(in_column, in_row)
-        bad = ~(np.isfinite(largest) & (largest > 0.0))
-        if np.any(bad):
-            row = int(np.argmax(bad))
-            msg = f"row {row} of the matrix is empty or not finite (largest entry {largest[row]})"
-            raise SingularMatrixError(msg)
-        return np.sqrt(largest)
+    Raises SingularMatrixError for an empty row or an entry that is not finite.
+    """
+    largest = np.zeros(len(indptr) - 1)
+    largest_entries(indptr, indices, data, largest)
+    bad = ~(np.isfinite(largest) & (largest > 0.0))
+    if np.any(bad):
+        row = int(np.argmax(bad))
+        msg = f"row {row} of the matrix is empty or not finite (largest entry {largest[row]})"
+        raise SingularMatrixError(msg)
+    return np.sqrt(largest)
 
 
 def _check_regular(factor: Factor, scale: FloatArray) -> None:
@@ -219,10 +205,9 @@ class _RslabAnalysis:
         usual = usable_cores() if n >= THREADED_FROM else 1
         self._symbolic = rslab.analyze(pattern, path="ldlt", threads=threads or usual)
         self._structure = indptr, indices
-        self._scaling = _Scaling(indptr, indices)
 
     def factor(self, data: FloatArray) -> Factor:
-        scale = self._scaling(data)
+        scale = _scaling(*self._structure, data)
         # rslab pivots inside a supernode only, which a constraint with a zero diagonal does not survive.
         constraints = np.flatnonzero(data[self._structure[0][:-1]] == 0.0)
         try:
@@ -286,6 +271,7 @@ class _SpluFactor:
 class _SpluAnalysis:
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
         n = len(indptr) - 1
+        self._structure = indptr, indices
         self._order = _elimination_order(indptr, indices)
         position = np.zeros(n, np.int64)
         position[self._order] = np.arange(n)
@@ -297,10 +283,9 @@ class _SpluAnalysis:
         self._entry = entry[by_column]
         self._rows = row[by_column].astype(np.int32)
         self._starts = np.searchsorted(column[by_column], np.arange(n + 1)).astype(np.int32)
-        self._scaling = _Scaling(indptr, indices)
 
     def factor(self, data: FloatArray) -> Factor:
-        scale = self._scaling(data)
+        scale = _scaling(*self._structure, data)
         n = len(self._order)
         factor = _SpluFactor(csc_array((data[self._entry], self._rows, self._starts), shape=(n, n)), self._order)
         _check_regular(factor, scale)

@@ -1,6 +1,7 @@
 """Stage `sensitivity`: whether the verified state is stable, and how its error moves with rig and material."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fab4d.design.robustness import (
     with_scaled_modulus,
 )
 from fab4d.solvers.linear import SingularMatrixError
+from fab4d.solvers.threads import side_by_side
 from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages.monitor import Monitor
 
@@ -118,28 +120,33 @@ def _rms_mm(equilibria: Equilibria, design: Design | None) -> float | None:
 def _hold_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
     """Each point moved in its own worst direction; all points in random ones."""
     L0, count = equilibria.problem.length, equilibria.patches.count
-    size = HOLD_MM / L0
+    size, unknowns = HOLD_MM / L0, 3 * equilibria.problem.n_nodes
 
     def simulated(dc: np.ndarray) -> float | None:
         return _rms_mm(equilibria, with_moved_points(equilibria, design, response, dc))
 
+    def all_simulated(some: np.ndarray) -> dict[int, float | None]:
+        found = side_by_side([partial(simulated, moves[k]) for k in some], unknowns)
+        return dict(zip(some.tolist(), found, strict=True))
+
     moves = [_alone(count, point, response.worst_move(point, size)) for point in range(count)]
     told = [response.rms_after(dc) * L0 for dc in moves]
     worst_first = np.argsort(told)[::-1]
-    found = {k: simulated(moves[k]) for k in worst_first[:SIMULATED_POINTS]}
+    found = all_simulated(worst_first[:SIMULATED_POINTS])
     holds = all(rms is not None and abs(told[k] - rms) <= MODEL_ERROR * rms for k, rms in found.items())
     random_model_rms = response.expected_rms(size) * L0
     random_rms: float | None = random_model_rms
     if not holds:
-        found |= {k: simulated(moves[k]) for k in worst_first[SIMULATED_POINTS:]}
-        random_rms = _root_mean_square([simulated(dc) for dc in _random_moves(count, size)])
+        found |= all_simulated(worst_first[SIMULATED_POINTS:])
+        random = [partial(simulated, dc) for dc in _random_moves(count, size)]
+        random_rms = _root_mean_square(side_by_side(random, unknowns))
     points = [
         {"point": k + 1, "direction": (moves[k][k] / size).tolist(), "model_rms_mm": told[k]}
         | {"simulated": k in found, "rms_mm": found.get(k)}
         for k in range(count)
     ]
-    random = {"random_rms_mm": random_rms, "random_model_rms_mm": random_model_rms}
-    return {"change_mm": HOLD_MM, "model_holds": holds, **random, "points": points}
+    expected = {"random_rms_mm": random_rms, "random_model_rms_mm": random_model_rms}
+    return {"change_mm": HOLD_MM, "model_holds": holds, **expected, "points": points}
 
 
 def _random_moves(count: int, size: float) -> list[np.ndarray]:
@@ -176,8 +183,9 @@ def _force_figures(equilibria: Equilibria, design: Design, response: Response) -
 
     L0 = equilibria.problem.length
     points = [{"point": k + 1, **alone(k)} for k in range(equilibria.patches.count)]
-    both = {"smaller": together(-FORCE_CHANGE), "larger": together(FORCE_CHANGE)}
-    return {"change": FORCE_CHANGE, **both, "points": points}
+    both = [partial(together, sign * FORCE_CHANGE) for sign in (-1, 1)]
+    smaller, larger = side_by_side(both, 3 * equilibria.problem.n_nodes)
+    return {"change": FORCE_CHANGE, "smaller": smaller, "larger": larger, "points": points}
 
 
 def _by_model(response: Response, change: np.ndarray, L0: float) -> dict[str, float]:
@@ -196,6 +204,7 @@ def _modulus_figures(equilibria: Equilibria, design: Design) -> dict[str, Any]:
         forces = None if found is None else float(np.linalg.norm(found.median.forces) / before)
         return {"rms_mm": _rms_mm(equilibria, found), "forces": forces}
 
-    signs = (("softer", -1), ("stiffer", 1))
-    phases = {p: {name: changed(p, 1 + sign * MODULUS_CHANGE) for name, sign in signs} for p in PHASES}
-    return {"change": MODULUS_CHANGE} | phases
+    signs = {"softer": -1, "stiffer": 1}
+    calls = [partial(changed, phase, 1 + sign * MODULUS_CHANGE) for phase in PHASES for sign in signs.values()]
+    found = iter(side_by_side(calls, 3 * equilibria.problem.n_nodes))
+    return {"change": MODULUS_CHANGE} | {phase: {name: next(found) for name in signs} for phase in PHASES}

@@ -1,7 +1,5 @@
 """Both direct solvers behind one interface: solutions, inertia, constraints, singular matrices, determinism."""
 
-import os
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -200,14 +198,6 @@ def test_sizes_that_are_not_triples(backend, n):
     A = 4 * np.eye(n) + np.ones((n, n))
     b = np.arange(1.0, n + 1)
     np.testing.assert_allclose(factor(A, backend).solve(b), np.linalg.solve(A, b), rtol=1e-12)
-
-
-def test_only_the_cores_that_are_given_are_used(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3}, raising=False)
-    assert linear.usable_cores() == 1
-    monkeypatch.delattr(os, "sched_getaffinity")
-    monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert linear.usable_cores() == 1
 
 
 def test_rslab_gives_the_same_bits_on_one_and_two_threads(bodies):

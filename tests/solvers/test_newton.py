@@ -76,3 +76,48 @@ def test_the_step_is_reversed_along_the_unstable_mode_alone(near_saddle):
 
 def test_many_negative_modes_are_left_to_the_fallback():
     assert descending(tangent(np.zeros(N)), np.ones(N), N, N) is None
+
+
+class Counted:
+    """The tangent, and how often it was factored."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, z: np.ndarray) -> Factor:
+        self.count += 1
+        return tangent(z)
+
+
+def test_the_factor_of_a_state_nearby_is_enough():
+    start, factor = np.full(N, 0.99), Counted()
+    found = newton(wells, factor, start, 1e-10, 20, no_fallback, near=tangent(start))
+    assert found.converged
+    assert np.allclose(found.z, 1.0)
+    assert factor.count == found.iterations == 0
+
+
+def test_a_factor_that_brings_little_is_replaced():
+    """The wells are 25 times as stiff at 1 as at 0.6: steps with the factor of there would go far too far."""
+    factor = Counted()
+    start, far = np.full(N, 0.82), np.full(N, 0.6)
+    found = newton(wells, factor, start, 1e-10, 20, no_fallback, near=tangent(far))
+    assert found.converged
+    assert np.allclose(found.z, 1.0)
+    assert factor.count == found.iterations >= 1
+
+
+def test_an_unstable_factor_is_not_used(near_saddle):
+    """With it alone the steps would end on the saddle."""
+    unstable = tangent(np.zeros(N))
+    assert unstable.n_negative == 1
+    found = newton(wells, tangent, near_saddle, 1e-10, 20, no_fallback, near=unstable)
+    assert np.allclose(found.z, 1.0)
+    assert np.allclose(newton(wells, tangent, near_saddle, 1e-10, 20, near=unstable).z, 0.0, atol=1e-8)
+
+
+def test_factors_are_used_again_between_iterations():
+    factor = Counted()
+    found = newton(wells, factor, np.full(N, 0.9), 1e-12, 20, no_fallback)
+    assert found.converged
+    assert factor.count < 4  # Newton's method alone needs 5
