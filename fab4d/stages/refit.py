@@ -1,7 +1,8 @@
 """Stage `refit`: the held positions that are best for the labels that will be printed."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from fab4d.fabrication.wellcomposed import flip_check
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
+from fab4d.solvers.threads import side_by_side
 from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
@@ -37,7 +39,7 @@ ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
 # So they do where the relaxed design is out of reach of the tolerance.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
-# Printed labels are compared after so many steps of the held positions.
+# Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
 Polish = Callable[[Design], Design]
 
@@ -52,8 +54,10 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
     settings = _flip_settings(inputs, profile, problem, weights)
-    design = _printed_design(equilibria, relaxed, rounded["smp"], weights, settings)
-    trace.add("printed", Search(equilibria, design))
+    first = _printed_design(equilibria, relaxed, rounded["smp"], weights, settings)
+    design = first.fitted
+    trace.add("printed", Search(equilibria, first.design))
+    trace.add("refit", Search(equilibria, design))
     fits, reached = 0, None
     if equilibria.patches.count:
         polish = _polish(equilibria, weights, settings, trace)
@@ -81,48 +85,51 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     }
 
 
+@dataclass(frozen=True, eq=False)
+class _Printed:
+    """Labels in equilibrium at the held positions of another design, and after some steps of these positions."""
+
+    design: Design
+    fitted: Design
+
+
 def _printed_design(
     equilibria: Equilibria,
     relaxed: Mapping[str, np.ndarray],
     smp: BoolArray,
     weights: ObjectiveWeights,
     settings: FlipSettings,
-) -> Design:
+) -> _Printed:
     """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
 
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
     short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair,
     if the equilibria agree.
     """
-    design = None
-    if equilibria.problem.n_tets > MANY_TETS:
-        design = _carried(equilibria, relaxed, smp.astype(np.float64))
+    problem, rho = equilibria.problem, smp.astype(np.float64)
+    design = _carried(equilibria, relaxed, rho) if problem.n_tets > MANY_TETS else None
     if design is not None:
-        return design
+        return _Printed(design, design)
     before, wanted = _relaxed_design(equilibria, relaxed), [smp]
     flips = influence_near(equilibria, before, smp, weights.error_scale)
     if flips is not None:
-        better = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
+        better = compensated(problem, flips, before.rho > 0.5, smp, settings)
         wanted += [better] if (better != smp).any() else []
-    found = [each for labels in wanted if (each := _followed(equilibria, before, labels)) is not None]
+    calls = [partial(_followed, equilibria, before, labels, weights) for labels in wanted]
+    found = [each for each in side_by_side(calls, 3 * problem.n_nodes) if each is not None]
     if not found:
-        rho = smp.astype(np.float64)
-        return _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
-    return found[0] if len(found) == 1 else min(found, key=lambda each: _fitted_rms(equilibria, each, weights))
+        design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
+        return _Printed(design, design)
+    return min(found, key=lambda each: shape_error(problem, each.fitted.final.y).rms)
 
 
-def _followed(equilibria: Equilibria, before: Design, smp: BoolArray) -> Design | None:
-    """The labels smp (m,) at the held positions of another design; None where no path of equilibria leads there."""
+def _followed(equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights) -> _Printed | None:
+    """The labels smp (m,); None where no path of equilibria leads to them."""
     try:
-        return change_density(equilibria, before, smp.astype(np.float64))
+        design = change_density(equilibria, before, smp.astype(np.float64))
     except EquilibriumError:
         return None
-
-
-def _fitted_rms(equilibria: Equilibria, design: Design, weights: ObjectiveWeights) -> float:
-    """The RMS error, L0, after some steps of the held positions: before them it tells little."""
-    fitted = refit(equilibria, design, weights, lambda at: None, iterations=FEW_STEPS)  # noqa: ARG005
-    return shape_error(equilibria.problem, fitted.final.y).rms
+    return _Printed(design, refit(equilibria, design, weights, lambda at: None, iterations=FEW_STEPS))  # noqa: ARG005
 
 
 def _programmed(done: Programming, smp: FloatArray) -> Design:

@@ -96,14 +96,14 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
     given = (equilibria, inputs["relaxed"], smp, weights, refit._flip_settings(inputs, PROFILE, problem, weights))
     monkeypatch.setattr(refit, "influence_near", lambda *_: None)
-    by_path = refit._printed_design(*given)
+    by_path = refit._printed_design(*given).design
 
     def not_taken(*_: Any) -> Design:
         raise AssertionError
 
     monkeypatch.setattr(refit, "MANY_TETS", 1)
     monkeypatch.setattr(refit, "change_density", not_taken)
-    at_once = refit._printed_design(*given)
+    at_once = refit._printed_design(*given).design
     np.testing.assert_allclose(at_once.median.x, by_path.median.x, atol=1e-5)
     R, t = best_rigid_motion(at_once.final.y, by_path.final.y)
     np.testing.assert_allclose(at_once.final.y @ R.T + t, by_path.final.y, atol=1e-5)
@@ -122,7 +122,7 @@ def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     spoilt[np.flatnonzero(at_interface(problem, spoilt))[::12]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
     as_they_are = change_density(equilibria, before, spoilt.astype(np.float64))
-    printed = refit._printed_design(equilibria, inputs["relaxed"], spoilt, weights, settings)
+    printed = refit._printed_design(equilibria, inputs["relaxed"], spoilt, weights, settings).design
     fits = [refit.refit(equilibria, each, weights, lambda at: None) for each in (as_they_are, printed)]  # noqa: ARG005
     assert rms(problem, fits[1]) <= rms(problem, fits[0])
 
