@@ -32,7 +32,7 @@ MOST_POOR = 3
 # fewer are tried next.
 SMALLEST_STEP, FEWER = 0.25, 3
 # Steps of the held positions after each round; once all are made, they are fitted to the end.
-FOLLOWING_STEPS = 2
+FOLLOWING_STEPS = 6
 
 Printable = Callable[[BoolArray], BoolArray]
 Flippable = Callable[[BoolArray, int], bool]
@@ -73,10 +73,10 @@ def polish_labels(
         smp = design.rho > 0.5
         if found is None:
             tets = np.flatnonzero(at_interface(problem, smp))
-            found = influence(equilibria, design, tets, weights.error_scale, int(MOST_CANDIDATES * finer))
+            found = influence(equilibria, design, tets, plain, int(MOST_CANDIDATES * finer))
         flipped = settings.printable(flip(problem, found, smp, smp, settings, batch))
         made = int((flipped != smp).sum())
-        if error_left(found, smp, flipped) ** 2 >= (1 - LEAST_ROUND_GAIN) * float(found.residual @ found.residual):
+        if error_left(found, smp, flipped) ** 2 >= (1 - LEAST_ROUND_GAIN) * error_left(found, smp, smp) ** 2:
             break
         trial = _changed(equilibria, design, flipped)
         if trial is None:
@@ -90,7 +90,8 @@ def polish_labels(
             batch = min(batch * 3 // 2, int(LARGEST_BATCH * finer))
             watch(Search(equilibria, design))
         else:
-            found = found.taught((flipped != smp)[found.tets], found.view.error(problem, trial.final.y))
+            seen = found.view.shape(problem, trial.final.y), found.view.limits.at(trial.median)
+            found = found.taught((flipped != smp)[found.tets], *seen)
             batch = made * 2 // 3
     return refit(equilibria, design, weights, watch) if design is not start else start
 
@@ -107,8 +108,8 @@ def compensated(
 
 
 def error_left(found: Influence, before: BoolArray, smp: BoolArray) -> float:
-    """The RMS error, L0, that `found` predicts for the labels smp (m,) instead of `before` (m,)."""
-    return float(np.linalg.norm(found.left((smp != before)[found.tets])))
+    """The error, L0, that `found` predicts for the labels smp (m,) instead of `before` (m,), limits included."""
+    return found.left((smp != before)[found.tets])
 
 
 def fineness(problem: Problem) -> float:
@@ -133,22 +134,28 @@ def flip(
     """
     labels, tets, volumes = labels.copy(), found.tets, problem.volume_fractions
     corners, pinching = problem.body.elements[tets, :4], np.zeros(len(tets), bool)
-    own, least = (found.change**2).sum(axis=1), LEAST_GAIN / fineness(problem)
-    residual = found.left((labels != before)[tets])
-    slope, squared = found.change @ residual, float(residual @ residual)
+    least = LEAST_GAIN / fineness(problem)
+    done = (labels != before)[tets]
+    shape = found.shape + found.shape_change[done].sum(axis=0)
+    slope, squared, toward = found.shape_change @ shape, float(shape @ shape), found.view.shape_by_held @ shape
+    beyond = found.beyond + found.limit_change[done].sum(axis=0)
     for _ in range(most):
+        at = found.settled(squared, toward, beyond)
         sign = np.where((labels != before)[tets], -1.0, 1.0)
         room = settings.max_smp_fraction - volumes @ labels
         allowed = at_interface(problem, labels)[tets] & (labels[tets] | (volumes[tets] <= room)) & ~pinching
-        gain = np.where(allowed, -2 * sign * slope - own, 0.0)
-        worth = np.flatnonzero(gain > least * squared)
+        gain = np.where(allowed, found.gains(at, slope, sign), 0.0)
+        worth = np.flatnonzero(gain > least * at.squared)
         for best in worth[np.argsort(-gain[worth])]:
             if settings.flippable(labels, int(tets[best])):
                 break
             pinching[best] = True
         else:
             break
-        slope, squared = slope + sign[best] * found.along(best), squared - float(gain[best])
+        squared += float(2 * sign[best] * slope[best] + found.own[best])
+        slope = slope + sign[best] * found.along(best)
+        toward = toward + sign[best] * found.toward[best]
+        beyond = beyond + sign[best] * found.limit_change[best]
         labels[tets[best]] = not labels[tets[best]]
         # Whether a flip pinches something depends on the tets that share a vertex with it.
         pinching &= ~np.isin(corners, corners[best]).any(axis=1)

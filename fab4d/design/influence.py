@@ -1,4 +1,4 @@
-"""What the other material in whole tets does to the final shape, by linear algebra alone.
+"""What the other material in whole tets does to the final shape and to active limits, by linear algebra alone.
 
 A flip changes the stiffness of its tet many times over, so a derivative with respect to its density is off by as much.
 Here the tet takes its other material, to first order in the displacements but with its whole stiffness, while all
@@ -7,17 +7,24 @@ whole part.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array, vstack
 
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import Equilibria, Median
 from fab4d.design.gauss_newton import HELD_STEP, Design
-from fab4d.design.objective import rigid_modes, shape_error
+from fab4d.design.objective import (
+    ObjectiveWeights,
+    forces_beyond,
+    rigid_modes,
+    shape_error,
+    squeeze,
+    stretch_excess,
+)
 from fab4d.design.problem import Problem
 from fab4d.design.sensitivity import Linearisation, element_dofs, force_columns, linearise
 from fab4d.elasticity import _kernels as kernels
@@ -30,9 +37,13 @@ from fab4d.solvers.threads import side_by_side
 SHARE_LEFT = 0.8
 # Held positions follow as a Gauss-Newton step with this damping lets them.
 HELD_DAMPING = 0.03
-# The whole surface is followed where the changes of it by all flips are at most so many numbers; else the error in
-# polynomials of this degree and in its own direction.
+# The whole surface is followed where the changes of all measures by all flips are at most so many numbers; else the
+# error in polynomials of this degree and in its own direction.
 MOST_NUMBERS, MODE_DEGREE = 30_000_000, 3
+# Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest.
+NEAR_LIMIT, MOST_LIMITS = 0.75, 300
+# The held positions settle among limits in so many tries of which of them hold back.
+MOST_ACTIVE_SETS = 10
 # How little a flip's worth follows what is seen of many.
 TEACH_RIDGE = 0.1
 # Dense systems and right-hand sides are made for so many tets at once.
@@ -40,139 +51,287 @@ AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
+class Limits:
+    """The limits of forces, stretches and squeezes that a design is at or near, as measures: the squares of those above
+    zero sum, with that of the RMS error in L0, to the objective times error_scale^2.
+
+    values (l,) : at the design        rows_x (l, 3N), rows_f (l, 3K) : derivatives by median shape and forces
+    """
+
+    values: FloatArray
+    rows_x: csr_array
+    rows_f: FloatArray
+    median: Median
+
+    def at(self, median: Median) -> FloatArray:
+        """(l,) at another median shape, to first order."""
+        dx, df = median.x - self.median.x, median.forces - self.median.forces
+        return self.values + self.rows_x @ dx.ravel() + self.rows_f @ df.ravel()
+
+    def changes(self, z: FloatArray) -> FloatArray:
+        """(l, q) by changes of median shape and forces (3N + 3K, q)."""
+        n = self.rows_x.shape[1]
+        return self.rows_x @ z[:n] + self.rows_f @ z[n:]
+
+
+def limits_near(equilibria: Equilibria, design: Design, weights: ObjectiveWeights, most: int) -> Limits:
+    """The limits that the design is beyond, and those that it is near: `most` at most."""
+    problem, median = equilibria.problem, design.median
+    scale, k = weights.error_scale / np.sqrt(2), 3 * equilibria.patches.count
+    forces = forces_beyond(weights, equilibria.patches, median)
+    stretch = stretch_excess(problem, weights, design.rho, median.x, NEAR_LIMIT)
+    squeezed = squeeze(problem, weights, median.x, NEAR_LIMIT)
+    values = np.concatenate([forces.values, stretch.values, squeezed.values])
+    no_shape, no_force = csr_array((len(forces.values), median.x.size)), np.zeros((len(values) - len(forces.values), k))
+    rows_x = vstack([no_shape, stretch.rows, squeezed.rows], format="csr")
+    rows_f = np.vstack([forces.rows, no_force])
+    kept = np.sort(np.argsort(-values, kind="stable")[:most])
+    return Limits(scale * values[kept], scale * rows_x[kept], scale * rows_f[kept], median)
+
+
+@dataclass(frozen=True, eq=False)
 class View:
-    """Linear measures (q,) of the final shape that neither rigid motions nor moves of the held positions change.
+    """Linear measures of a design: (p,) of its final shape, which rigid motions do not change, and (l,) of its limits.
 
     on_surface (s,) : dofs that are looked at        root (s,) : roots of their area weights
-    basis (s, q) : orthonormal measures; None for all        rigid (s, 6) : weighted, orthonormal rigid modes
-    by_held (3K, q) : derivatives by the held positions        follow (q, 3K) : what these take away of them
+    basis (s, p) : orthonormal measures of it; None for all        rigid (s, 6) : weighted, orthonormal rigid modes
+    shape_by_held (3K, p), limits_by_held (3K, l) : derivatives by the held positions
+    gram (3K, 3K) : what moves of the held positions cost, their effect on the shape included
     """
 
     on_surface: IntArray
     root: FloatArray
     rigid: FloatArray
     basis: FloatArray | None
-    by_held: FloatArray
-    follow: FloatArray
+    limits: Limits
+    shape_by_held: FloatArray
+    limits_by_held: FloatArray
+    gram: FloatArray
+
+    def shape(self, problem: Problem, y: FloatArray) -> FloatArray:
+        """(p,) error of the final shape y (N, 3)."""
+        return _measured(_weighted_error(problem, y, self.on_surface, self.root), self.rigid, self.basis)
 
     def without_held(self, v: FloatArray) -> FloatArray:
-        """Measures (..., q) without what the held positions take away."""
-        return v - (v @ self.by_held.T) @ self.follow.T
+        """Measures of the shape (..., p) without what the held positions take away where no limit holds them back."""
+        follow = np.linalg.solve(self.gram, self.shape_by_held)
+        return v - (v @ self.shape_by_held.T) @ follow
 
     def error(self, problem: Problem, y: FloatArray) -> FloatArray:
-        """(q,) that of the final shape y (N, 3)."""
-        return self.without_held(
-            _measured(_weighted_error(problem, y, self.on_surface, self.root), self.rigid, self.basis)
-        )
+        """(p,) that of the final shape y (N, 3), without what the held positions take away."""
+        return self.without_held(self.shape(problem, y))
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A predicted design with the held positions where they lower the objective most.
+
+    squared : its error in L0, squared, and that of the limits that it is beyond
+    beyond (l,) : of each limit        active (l,) : whether it holds back        moves (3K,) : of the held positions
+    """
+
+    squared: float
+    beyond: FloatArray
+    active: BoolArray
+    moves: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Influence:
-    """The error of the final shape as a vector whose length is the RMS error in L0, and what flips change of it.
+    """What flips of tets change of the error of a design, a vector whose length is its RMS error in L0, and of limits.
 
-    tets (k,) : that may be flipped        change (k, q) : by each flip        residual (q,) : the error
-    Both are without what the held positions take away.
+    tets (k,) : that may be flipped        shape (p,), beyond (l,) : measures of the design
+    shape_change (k, p), limit_change (k, l) : by each flip at fixed held positions
     """
 
     tets: IntArray
-    change: FloatArray
-    residual: FloatArray
+    shape: FloatArray
+    beyond: FloatArray
+    shape_change: FloatArray
+    limit_change: FloatArray
     view: View
 
-    def left(self, flipped: BoolArray) -> FloatArray:
-        """(q,) the error with the tets `flipped` (k,)."""
-        return self.residual + self.change[flipped].sum(axis=0)
+    @cached_property
+    def change(self) -> FloatArray:
+        """(k, p) of the shape by each flip, without what the held positions take away."""
+        return self.view.without_held(self.shape_change)
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """(p,) error of the shape, without what the held positions take away."""
+        return self.view.without_held(self.shape)
+
+    @cached_property
+    def toward(self) -> FloatArray:
+        """(k, 3K) gradients by the held positions, to which each flip leads."""
+        return self.shape_change @ self.view.shape_by_held.T
+
+    @cached_property
+    def own(self) -> FloatArray:
+        """(k,) squares of the changes of the shape."""
+        return np.einsum("kp,kp->k", self.shape_change, self.shape_change)
 
     @cached_property
     def overlaps(self) -> FloatArray | None:
         """(k, k) scalar products of the changes; None where these are shorter than they are many."""
-        return None if len(self.tets) > self.change.shape[1] else self.change @ self.change.T
+        many = len(self.tets) > self.shape_change.shape[1]
+        return None if many else self.shape_change @ self.shape_change.T
 
     def along(self, k: int) -> FloatArray:
-        """(k,) scalar products of all changes with the k-th."""
-        return self.change @ self.change[k] if self.overlaps is None else self.overlaps[k]
+        """(k,) scalar products of all changes of the shape with the k-th."""
+        return self.shape_change @ self.shape_change[k] if self.overlaps is None else self.overlaps[k]
 
-    def taught(self, flipped: BoolArray, error: FloatArray) -> "Influence":
-        """The same after the tets `flipped` (k,) have really left the error (q,): what they do together is that.
+    def left(self, flipped: BoolArray) -> float:
+        """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
+        shape = self.shape + self.shape_change[flipped].sum(axis=0)
+        beyond = self.beyond + self.limit_change[flipped].sum(axis=0)
+        return float(np.sqrt(self.settled(float(shape @ shape), self.view.shape_by_held @ shape, beyond).squared))
 
-        Each is worth as much more or less as explains it best, and the rest is shared in proportion to their squares.
+    def settled(self, squared: float, toward: FloatArray, beyond: FloatArray) -> Settled:
+        """Held positions that settle where the shape has this squared error and gradient (3K,), by an active set.
+
+        beyond (l,) : of each limit before they move
+        """
+        view, active, moves = self.view, beyond > 0, np.zeros(len(toward))
+        for _ in range(MOST_ACTIVE_SETS):
+            by_held = view.limits_by_held[:, active]
+            pull = toward + by_held @ beyond[active]
+            moves = -np.linalg.solve(view.gram + by_held @ by_held.T, pull).astype(np.float64)
+            before, active = active, beyond + moves @ view.limits_by_held > 0
+            if (active == before).all():
+                break
+        settled = beyond + moves @ view.limits_by_held
+        squared += float(2 * toward @ moves + moves @ view.gram @ moves + (np.maximum(settled, 0) ** 2).sum())
+        return Settled(max(squared, 0.0), settled, settled > 0, moves)
+
+    def gains(self, at: Settled, slope: FloatArray, sign: FloatArray) -> FloatArray:
+        """(k,) how far each flip lowers the squared error, held positions following.
+
+        slope (k,) : scalar products of the changes with the error of the shape before the held positions moved
+        sign (k,) : -1 for flips that are taken back
+        """
+        view, active = self.view, at.active
+        by_held, change = view.limits_by_held[:, active], self.limit_change[:, active]
+        pull = self.toward + change @ by_held.T
+        followed = np.linalg.solve(view.gram + by_held @ by_held.T, pull.T).T
+        own = self.own + (change**2).sum(axis=1) - np.einsum("kc,kc->k", pull, followed)
+        first = slope + self.toward @ at.moves + change @ at.beyond[active]
+        others = at.beyond[~active] + sign[:, None] * self.limit_change[:, ~active]
+        return np.asarray(-2 * sign * first - own - (np.maximum(others, 0) ** 2).sum(axis=1), np.float64)
+
+    def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
+        """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.
+
+        Each is worth as much more or less as explains the error best, and the rest is shared in proportion to squares.
         """
         done = self.change[flipped]
         gram = done @ done.T
         ridge = TEACH_RIDGE * np.trace(gram) / len(done)
-        misfit = error - self.residual - done.sum(axis=0)
+        misfit = self.view.without_held(shape) - self.residual - done.sum(axis=0)
         worth = 1 + np.linalg.solve(gram + ridge * np.eye(len(done)), done @ misfit)
-        better = worth[:, None] * done
-        share = (better**2).sum(axis=1) / (better**2).sum()
-        change = self.change.copy()
-        change[flipped] = better + np.outer(share, error - self.residual - better.sum(axis=0))
-        return replace(self, change=change)
+        shapes = _shared(worth[:, None] * self.shape_change[flipped], shape - self.shape)
+        limits = _shared(worth[:, None] * self.limit_change[flipped], beyond - self.beyond)
+        shape_change, limit_change = self.shape_change.copy(), self.limit_change.copy()
+        shape_change[flipped], limit_change[flipped] = shapes, limits
+        return Influence(self.tets, self.shape, self.beyond, shape_change, limit_change, self.view)
+
+
+def _shared(changes: FloatArray, total: FloatArray) -> FloatArray:
+    """(k, q) near these changes, with the sum `total` (q,)."""
+    share = (changes**2).sum(axis=1)
+    whole = share.sum()
+    share = share / whole if whole > 0 else np.full(len(changes), 1 / len(changes))
+    return changes + np.outer(share, total - changes.sum(axis=0))
 
 
 def influence(
-    equilibria: Equilibria, design: Design, tets: IntArray, error_scale: float, most: int | None = None
+    equilibria: Equilibria, design: Design, tets: IntArray, weights: ObjectiveWeights, most: int | None = None
 ) -> Influence:
-    """What a flip of each of `tets` of a near 0/1 design does to the error, or of the `most` that promise most.
-
-    error_scale : RMS error, L0, that is worth a move of the held positions
-    """
+    """What a flip of each of `tets` of a near 0/1 design does to its error, or of the `most` that promise most."""
     problem, y = equilibria.problem, design.final.y
-    weights = np.repeat(problem.area_weights, 3)
-    on_surface = np.flatnonzero(weights)
-    root = np.sqrt(weights[on_surface])
+    areas = np.repeat(problem.area_weights, 3)
+    on_surface = np.flatnonzero(areas)
+    root = np.sqrt(areas[on_surface])
     rigid, _ = np.linalg.qr(root[:, None] * rigid_modes(y).reshape(-1, 6)[on_surface])
     e = _weighted_error(problem, y, on_surface, root)
+    limits = limits_near(equilibria, design, weights, MOST_LIMITS)
     lin = linearise(equilibria, design.rho, design.median, design.final)
 
-    def in_modes(basis: FloatArray) -> tuple[FloatArray, FloatArray]:
-        directions = np.zeros((y.size, basis.shape[1]))
-        directions[on_surface] = root[:, None] * basis
-        return _in_modes(lin, _loads(equilibria, design, lin, tets), len(tets), directions)
+    def gradients(basis: FloatArray, of_limits: FloatArray) -> Gradients:
+        """Of the measures `basis` (s, q) of the shape and of_limits (l, q) of the limits."""
+        gy = np.zeros((y.size, basis.shape[1]))
+        gy[on_surface] = root[:, None] * basis
+        return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, gy)
 
     if most is not None and len(tets) > most:
-        along_error, _ = in_modes(_measured(e, rigid, None)[:, None])
-        tets = np.sort(tets[np.argsort(along_error[:, 0], kind="stable")[:most]])
-    basis = None
-    if len(tets) * len(on_surface) <= MOST_NUMBERS:
-        loads = _loads(equilibria, design, lin, tets)
-        change, by_held = _on_the_surface(lin, loads, len(tets), on_surface, root, rigid)
+        along_error = gradients(_measured(e, rigid, None)[:, None], np.maximum(limits.values, 0)[:, None])
+        promise, _ = _in_modes(lin, _loads(equilibria, design, lin, tets), len(tets), along_error)
+        tets = np.sort(tets[np.argsort(promise[:, 0], kind="stable")[:most]])
+    basis, loads, count = None, _loads(equilibria, design, lin, tets), len(limits.values)
+    if len(tets) * (len(on_surface) + count) <= MOST_NUMBERS:
+        change, by_held = _on_the_surface(lin, loads, len(tets), on_surface, root, rigid, limits)
     else:
         basis = _smooth_modes(problem, root, rigid, e, on_surface)
-        change, by_held = in_modes(basis)
-    ridge = HELD_DAMPING * error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
-    follow = np.linalg.solve(by_held @ by_held.T + ridge * np.eye(len(by_held)), by_held).T.astype(np.float64)
-    view = View(on_surface, root, rigid, basis, by_held, follow)
-    return Influence(tets, SHARE_LEFT * view.without_held(change), view.error(problem, y), view)
+        modes = np.hstack([basis, np.zeros((len(basis), count))])
+        each_limit = np.hstack([np.zeros((count, basis.shape[1])), np.eye(count)])
+        change, by_held = _in_modes(lin, loads, len(tets), gradients(modes, each_limit))
+    width = change.shape[1] - count
+    ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
+    gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
+    view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)
+    change *= SHARE_LEFT
+    return Influence(tets, view.shape(problem, y), limits.values, change[:, :width], change[:, width:], view)
 
 
-# -- from loads to shapes
+# -- from loads to measures
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Of q measures, with respect to x (3N, q), f (3K, q) and y (3N, q)."""
+
+    x: FloatArray
+    f: FloatArray
+    y: FloatArray
+
 
 # Each computes forces of some tets, and where these tets are among all.
 Loads = list[Callable[[], tuple[slice, csc_array, csc_array]]]
 
 
 def _on_the_surface(
-    lin: Linearisation, loads: Loads, n_tets: int, on_surface: IntArray, root: FloatArray, rigid: FloatArray
+    lin: Linearisation,
+    loads: Loads,
+    n_tets: int,
+    on_surface: IntArray,
+    root: FloatArray,
+    rigid: FloatArray,
+    limits: Limits,
 ) -> tuple[FloatArray, FloatArray]:
-    """Change (k, s) by each flip and derivative (3K, s) by the held positions of the weighted boundary positions."""
-    change = np.zeros((n_tets, len(on_surface)))
+    """Change (k, s + l) by each flip and derivative (3K, s + l) by the held positions, of the weighted boundary
+    positions and of the limits."""
+
+    def seen(z: FloatArray, dy: FloatArray) -> FloatArray:
+        shape = _measured((root[:, None] * dy[on_surface]).T, rigid, None)
+        return np.hstack([shape, limits.changes(z).T])
+
+    change = np.zeros((n_tets, len(on_surface) + len(limits.values)))
 
     def follow(load: Callable[[], tuple[slice, csc_array, csc_array]]) -> None:
         part, hot, cold = load()
         held = np.zeros((3 * lin.n_patches, hot.shape[1]))
-        _, dy = lin.respond(-np.vstack([hot.toarray(), held]), -cold.toarray())
-        change[part] = (root[:, None] * dy[on_surface]).T
+        change[part] = seen(*lin.respond(-np.vstack([hot.toarray(), held]), -cold.toarray()))
 
     side_by_side([partial(follow, load) for load in loads], lin.M.shape[0])
-    by_held = (root[:, None] * lin.held_columns()[2][on_surface]).T
-    return _measured(change, rigid, None), _measured(by_held, rigid, None)
+    dx, df, dy = lin.held_columns()
+    return change, seen(np.vstack([dx, df]), dy)
 
 
-def _in_modes(lin: Linearisation, loads: Loads, n_tets: int, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same of the measures with gradients `directions` (3N, q): a solution for each of them, not for each flip."""
-    n = len(directions)
-    of_median, of_final = lin.adjoint_states(directions)
-    change = np.zeros((n_tets, directions.shape[1]))
+def _in_modes(lin: Linearisation, loads: Loads, n_tets: int, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
+    """The same of measures with these gradients: a solution for each of them, not for each flip."""
+    n = lin.M.shape[0]
+    of_median, of_final = lin.adjoint_states(gradients.x, gradients.f, gradients.y)
+    change = np.zeros((n_tets, gradients.y.shape[1]))
     for load in loads:
         part, hot, cold = load()
         change[part] = -(hot.T @ of_median[:n] + cold.T @ of_final)

@@ -177,8 +177,13 @@ class StretchExcess:
         return gradient
 
 
-def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray, x: FloatArray) -> StretchExcess:
-    """Principal stretches of x (N, 3) beyond the limit, which is mixed of the materials' by rho (m,)."""
+def stretch_excess(
+    problem: Problem, weights: ObjectiveWeights, rho: FloatArray, x: FloatArray, share: float = 1.0
+) -> StretchExcess:
+    """Principal stretches of x (N, 3) beyond the limit, which is mixed of the materials' by rho (m,).
+
+    share : of the limit from which on tets are looked at; below it the excess is negative
+    """
     body = problem.body
     if np.isinf(weights.smp_max_stretch) or np.isinf(weights.tpe_max_stretch):
         return StretchExcess(np.zeros(0, np.int64), np.zeros(0), csr_array((0, x.size)), np.zeros(0))
@@ -186,9 +191,9 @@ def stretch_excess(problem: Problem, weights: ObjectiveWeights, rho: FloatArray,
     dN = body.dN.mean(axis=1)
     F = np.einsum("mai,maj->mij", x[body.elements], dN)
     # The Frobenius norm bounds the largest stretch from above: most tets need no singular values.
-    near = np.flatnonzero(np.sqrt((F**2).sum(axis=(1, 2))) > allowed)
+    near = np.flatnonzero(np.sqrt((F**2).sum(axis=(1, 2))) > share * allowed)
     U, s, Vt = np.linalg.svd(F[near])
-    over = s[:, 0] > allowed[near]
+    over = s[:, 0] > share * allowed[near]
     tets, largest = near[over], s[over, 0]
     scale = np.sqrt(2 * weights.limit) / allowed[tets]
     values = scale * (largest - allowed[tets])
@@ -214,8 +219,10 @@ class Squeeze:
     rows: csr_array
 
 
-def squeeze(problem: Problem, weights: ObjectiveWeights, x: FloatArray) -> Squeeze:
+def squeeze(problem: Problem, weights: ObjectiveWeights, x: FloatArray, share: float = 1.0) -> Squeeze:
     """Smallest principal stretches of x (N, 3) below weights.least_stretch.
+
+    share : tets are looked at up to so many times less squeeze; above the least stretch their values are negative
 
     A free surface that is squeezed farther turns unstable in short waves (Biot, Appl. Sci. Res. A 12 (1963) 168): such
     a shape depends on the way that leads to it.
@@ -226,9 +233,10 @@ def squeeze(problem: Problem, weights: ObjectiveWeights, x: FloatArray) -> Squee
     dN = body.dN.mean(axis=1)
     F = np.einsum("mai,maj->mij", x[body.elements], dN)
     # sigma_3 = det F / (sigma_1 sigma_2) >= 2 det F / |F|^2: most tets need no singular values.
-    near = np.flatnonzero(2 * np.linalg.det(F) < weights.least_stretch * (F**2).sum(axis=(1, 2)))
+    from_here = weights.least_stretch / share
+    near = np.flatnonzero(2 * np.linalg.det(F) < from_here * (F**2).sum(axis=(1, 2)))
     U, s, Vt = np.linalg.svd(F[near])
-    over = s[:, 2] < weights.least_stretch
+    over = s[:, 2] < from_here
     tets, smallest = near[over], s[over, 2]
     scale = np.sqrt(2 * weights.lam_squeeze * problem.volume_fractions[tets])
     values = scale * (1 - smallest / weights.least_stretch)

@@ -124,14 +124,13 @@ class Linearisation:
         cold[self.free_fixed] = 0.0
         return z, self.free.solve_many(cold)
 
-    def adjoint_states(self, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradients by the loads of `respond`, (3N + 3K, q) and (3N, q), of q functions with gradients gy (3N, q)."""
-        n = self.M.shape[0]
+    def adjoint_states(self, gx: FloatArray, gf: FloatArray, gy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients by the loads of `respond`, (3N + 3K, q) and (3N, q), of q functions with gradients gx (3N, q),
+        gf (3K, q) and gy (3N, q)."""
         b = gy.copy()
         b[self.free_fixed] = 0.0
         ly = self.free.solve_many(b)
-        rhs = np.zeros((n + 3 * self.n_patches, gy.shape[1]))
-        rhs[:n] = -(self.MT @ ly)
+        rhs = np.vstack([gx - self.MT @ ly, gf])
         rhs[self.held_fixed] = 0.0
         return self.held.solve_many(rhs), ly
 

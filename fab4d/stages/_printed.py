@@ -48,7 +48,7 @@ def as_printed(
     `good_enough`, L0, and where they cannot reach the tolerance.
     """
     settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
-    smp = repaired(mesh, printer, settings, found, weights.error_scale, more=0).smp
+    smp = repaired(mesh, printer, settings, found, weights, more=0).smp
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))
     except EquilibriumError:

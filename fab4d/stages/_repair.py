@@ -9,6 +9,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings, at_interface, compensated, error_left
 from fab4d.design.gauss_newton import Design
 from fab4d.design.influence import Influence, influence
+from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.reduced import Search
 from fab4d.io.scene import PrinterCard
 from fab4d.mesh.measures import tet_volumes
@@ -39,12 +40,12 @@ def repaired(
     printer: PrinterCard,
     settings: FlipSettings,
     found: Search,
-    error_scale: float,
+    weights: ObjectiveWeights,
     more: int = MORE_REPAIRS,
 ) -> Repair:
     """The repair of a near 0/1 design that promises the smallest error, SMP within the share that settings allow.
 
-    error_scale : RMS error, L0, that is worth a move of the held positions        more : repairs by random costs
+    more : repairs by random costs
 
     The cost is the tet's volume or how far its flip moves the finished shape: the latter where it promises a clearly
     smaller error, for it turns TPE to SMP rather than SMP to TPE, which moves more.
@@ -53,7 +54,7 @@ def repaired(
     volumes, before = np.abs(tet_volumes(X, tets)), found.design.rho > 0.5
     by_volume = volumes / volumes.mean()
     usual = labels_for(X, tets, rho, by_volume, printer).smp
-    flips = influence_near(found.equilibria, found.design, usual, error_scale)
+    flips = influence_near(found.equilibria, found.design, usual, weights)
     if flips is None or not flips.change.any():
         return Repair(by_volume, usual)
 
@@ -76,7 +77,9 @@ def repaired(
     return best
 
 
-def influence_near(equilibria: Equilibria, design: Design, smp: BoolArray, error_scale: float) -> Influence | None:
+def influence_near(
+    equilibria: Equilibria, design: Design, smp: BoolArray, weights: ObjectiveWeights
+) -> Influence | None:
     """What flips do of the tets that labels smp (m,) change in a near 0/1 design, and of those at an interface.
 
     None where there are none, or no points whose forces could change.
@@ -85,7 +88,7 @@ def influence_near(equilibria: Equilibria, design: Design, smp: BoolArray, error
     near = at_interface(problem, smp) | at_interface(problem, before) | (smp != before)
     if not equilibria.patches.count or not near.any():
         return None
-    return influence(equilibria, design, np.flatnonzero(near), error_scale)
+    return influence(equilibria, design, np.flatnonzero(near), weights)
 
 
 def _other_costs(by_volume: FloatArray, flips: Influence, more: int) -> Iterator[FloatArray]:

@@ -111,7 +111,7 @@ def _printed_design(
     if design is not None:
         return _Printed(design, design)
     before, wanted = _relaxed_design(equilibria, relaxed), [smp]
-    flips = influence_near(equilibria, before, smp, weights.error_scale)
+    flips = influence_near(equilibria, before, smp, weights)
     if flips is not None:
         better = compensated(problem, flips, before.rho > 0.5, smp, settings)
         wanted += [better] if (better != smp).any() else []

@@ -414,12 +414,12 @@ def _artifacts(
     mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], found: Search, trace: Trace, report: dict[str, Any]
 ) -> dict[str, Any]:
     problem, design = found.equilibria.problem, found.design
-    error_scale = search_settings(problem, profile).weights.error_scale
-    flips = flip_settings(mesh, profile["printer"], profile["goal"], error_scale)
+    weights = search_settings(problem, profile).weights
+    flips = flip_settings(mesh, profile["printer"], profile["goal"], weights.error_scale)
     more = 0 if problem.n_tets > MANY_TETS else MORE_REPAIRS
     relaxed = {
         "rho": design.rho,
-        "repair_cost": repaired(mesh, profile["printer"], flips, found, error_scale, more).cost,
+        "repair_cost": repaired(mesh, profile["printer"], flips, found, weights, more).cost,
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),

@@ -9,13 +9,13 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import at_interface
 from fab4d.design.gauss_newton import Design, equilibrate, held_positions
 from fab4d.design.influence import Influence, flip_forces, influence
-from fab4d.design.objective import shape_error
+from fab4d.design.objective import ObjectiveWeights, shape_error, squeeze, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.sensitivity import linearise
 from fab4d.elasticity import _kernels as kernels
 from fab4d.materials.cards import Moduli
 
-SCALE = 5e-3
+WEIGHTS = ObjectiveWeights(error_scale=5e-3)
 
 
 def half_smp(problem: Problem) -> np.ndarray:
@@ -79,14 +79,20 @@ def test_flipped_tets_exert_what_their_new_material_does_where_it_moves_them(
         assert coarse == pytest.approx(4 * fine, rel=0.2)
 
 
-def true_change(equilibria: Equilibria, design: Design, tet: int, found: Influence) -> np.ndarray:
-    """Of the error, by the equilibria with the other material in a tet."""
+def flipped_design(equilibria: Equilibria, design: Design, tet: int) -> Design:
+    """The equilibria with the other material in a tet."""
     rho = design.rho.copy()
     rho[tet] = 1 - rho[tet]
     x, f, y = design.median.x, design.median.forces, design.final.y
     after = equilibrate(equilibria, rho, held_positions(equilibria, design.median), x, f, y, TIGHT, 60)
     assert after is not None
-    return found.view.error(equilibria.problem, after.final.y) - found.residual
+    return after
+
+
+def true_change(equilibria: Equilibria, design: Design, tet: int, found: Influence) -> np.ndarray:
+    """Of the error, by the equilibria with the other material in a tet."""
+    y = flipped_design(equilibria, design, tet).final.y
+    return found.view.error(equilibria.problem, y) - found.residual
 
 
 def test_predicted_changes_are_near_those_of_the_equilibria(
@@ -96,7 +102,7 @@ def test_predicted_changes_are_near_those_of_the_equilibria(
     monkeypatch.setattr(module, "HELD_DAMPING", 1e12)  # nothing follows
     equilibria, design, tets = state
     some = tets[::7]
-    found = influence(equilibria, design, some, SCALE)
+    found = influence(equilibria, design, some, WEIGHTS)
     lin, problem = linearise(equilibria, design.rho, design.median, design.final), equilibria.problem
     alike, worth, by_derivative = [], [], []
     for k, tet in enumerate(some):
@@ -121,9 +127,9 @@ def test_modes_are_measures_of_what_the_surface_shows(
 ) -> None:
     equilibria, design, tets = state
     monkeypatch.setattr(module, "HELD_DAMPING", 1e12)  # nothing follows
-    whole = influence(equilibria, design, tets, SCALE)
+    whole = influence(equilibria, design, tets, WEIGHTS)
     monkeypatch.setattr(module, "MOST_NUMBERS", 0)
-    smooth = influence(equilibria, design, tets, SCALE)
+    smooth = influence(equilibria, design, tets, WEIGHTS)
     basis = smooth.view.basis
     assert basis is not None
     np.testing.assert_allclose(smooth.change, whole.change @ basis, atol=1e-7 * np.abs(whole.change).max())
@@ -135,33 +141,116 @@ def test_modes_are_measures_of_what_the_surface_shows(
 
 def test_held_positions_take_away_what_they_can(state: tuple[Equilibria, Design, np.ndarray]) -> None:
     equilibria, design, tets = state
-    found = influence(equilibria, design, tets[:1], SCALE)
-    moves = np.random.default_rng(0).normal(size=len(found.view.by_held))
-    moved = moves @ found.view.by_held
+    found = influence(equilibria, design, tets[:1], WEIGHTS)
+    by_held = found.view.shape_by_held
+    moved = np.random.default_rng(0).normal(size=len(by_held)) @ by_held
     assert np.linalg.norm(found.view.without_held(moved)) < 0.1 * np.linalg.norm(moved)
     assert np.linalg.norm(found.residual) <= shape_error(equilibria.problem, design.final.y).rms * (1 + 1e-9)
 
 
 def test_what_is_taught_is_predicted(state: tuple[Equilibria, Design, np.ndarray]) -> None:
     equilibria, design, tets = state
-    found = influence(equilibria, design, tets, SCALE)
+    found = influence(equilibria, design, tets, limiting(equilibria, design))
     flipped = np.zeros(len(tets), bool)
     flipped[::3] = True
     # One is worth half of what was thought, the others all of it, and there is something that none explains.
-    other = np.zeros_like(found.residual)
-    other[:5] = 0.1 * np.linalg.norm(found.residual)
-    seen = found.left(flipped) - 0.5 * found.change[0] + other
-    taught = found.taught(flipped, seen)
-    np.testing.assert_allclose(taught.left(flipped), seen, atol=1e-12 * np.abs(seen).max())
+    other = np.zeros_like(found.shape)
+    other[:5] = 0.1 * np.linalg.norm(found.shape)
+    shape = found.shape + found.shape_change[flipped].sum(axis=0) - 0.5 * found.shape_change[0] + other
+    beyond = found.beyond + 2 * found.limit_change[flipped].sum(axis=0)
+    taught = found.taught(flipped, shape, beyond)
+    size = np.abs(shape).max()
+    np.testing.assert_allclose(taught.shape + taught.shape_change[flipped].sum(axis=0), shape, atol=1e-12 * size)
+    np.testing.assert_allclose(taught.beyond + taught.limit_change[flipped].sum(axis=0), beyond, atol=1e-12)
     np.testing.assert_array_equal(taught.change[~flipped], found.change[~flipped])
-    again = taught.taught(flipped, seen)
+    again = taught.taught(flipped, shape, beyond)
     np.testing.assert_allclose(again.change, taught.change, atol=1e-12 * np.abs(taught.change).max())
+
+
+# -- limits
+
+
+def limiting(equilibria: Equilibria, design: Design) -> ObjectiveWeights:
+    """Limits that some tets of the design are beyond, and more are near."""
+    F = np.einsum("mai,maj->mij", design.median.x[equilibria.problem.body.elements], equilibria.problem.body.dN.mean(1))
+    stretches = np.linalg.svd(F)[1]
+    most, least = np.quantile(stretches[:, 0], 0.97), np.quantile(stretches[:, 2], 0.03)
+    return WEIGHTS.replace(limit=0.1, smp_max_stretch=most, tpe_max_stretch=most, least_stretch=least, lam_squeeze=10.0)
+
+
+def test_the_length_of_all_measures_is_the_objective(state: tuple[Equilibria, Design, np.ndarray]) -> None:
+    equilibria, design, tets = state
+    weights = limiting(equilibria, design)
+    found = influence(equilibria, design, tets[:1], weights)
+    assert (found.beyond > 0).any()
+    assert (found.beyond < 0).any()
+    problem, x = equilibria.problem, design.median.x
+    beyond = (stretch_excess(problem, weights, design.rho, x), squeeze(problem, weights, x))
+    error = shape_error(problem, design.final.y).rms ** 2
+    penalties = 0.5 * weights.error_scale**2 * sum(float((each.values**2).sum()) for each in beyond)
+    assert penalties > 0
+    squared = float((found.shape**2).sum() + (np.maximum(found.beyond, 0) ** 2).sum())
+    assert squared == pytest.approx(error + penalties)
+
+
+@pytest.mark.parametrize("in_modes", [False, True])
+def test_predicted_limits_are_near_those_of_the_equilibria(
+    state: tuple[Equilibria, Design, np.ndarray], monkeypatch: pytest.MonkeyPatch, in_modes: bool
+) -> None:
+    monkeypatch.setattr(module, "MOST_NUMBERS", 0 if in_modes else module.MOST_NUMBERS)
+    equilibria, design, tets = state
+    some = tets[::7]
+    found = influence(equilibria, design, some, limiting(equilibria, design))
+    alike = []
+    for k, tet in enumerate(some):
+        after = flipped_design(equilibria, design, int(tet))
+        true, change = found.view.limits.at(after.median) - found.beyond, found.limit_change[k]
+        alike.append((true @ change) / (np.linalg.norm(true) * np.linalg.norm(change)))
+    assert np.median(alike) > 0.9
+
+
+def test_held_positions_settle_where_shape_and_limits_together_are_least(
+    state: tuple[Equilibria, Design, np.ndarray],
+) -> None:
+    """No other moves do better, and limits cost more where they are not free to follow."""
+    equilibria, design, tets = state
+    found = influence(equilibria, design, tets, limiting(equilibria, design))
+    view, squared = found.view, float(found.shape @ found.shape)
+    at = found.settled(squared, view.shape_by_held @ found.shape, found.beyond)
+
+    def objective(moves: np.ndarray) -> float:
+        shape, beyond = found.shape + moves @ view.shape_by_held, found.beyond + moves @ view.limits_by_held
+        cost = moves @ (view.gram - view.shape_by_held @ view.shape_by_held.T) @ moves
+        return float(shape @ shape + (np.maximum(beyond, 0) ** 2).sum() + cost)
+
+    assert at.squared == pytest.approx(objective(at.moves), rel=1e-9)
+    random = np.random.default_rng(0)
+    for size in (1e-5, 1e-4, 1e-3):
+        assert objective(at.moves + size * random.normal(size=len(at.moves))) >= at.squared * (1 - 1e-9)
+    assert found.left(np.zeros(len(tets), bool)) == pytest.approx(np.sqrt(at.squared))
+
+
+def test_gains_are_what_the_settled_error_falls_by(state: tuple[Equilibria, Design, np.ndarray]) -> None:
+    """Of flips that make no limit active or inactive; others gain hardly less once the positions settle again."""
+    equilibria, design, tets = state
+    found = influence(equilibria, design, tets, limiting(equilibria, design))
+    none = np.zeros(len(tets), bool)
+    at = found.settled(float(found.shape @ found.shape), found.view.shape_by_held @ found.shape, found.beyond)
+    gains = found.gains(at, found.shape_change @ found.shape, np.ones(len(tets)))
+    exact = 0
+    for k in range(len(tets)):
+        flipped = none.copy()
+        flipped[k] = True
+        true = at.squared - found.left(flipped) ** 2
+        assert true >= gains[k] - 1e-3 * at.squared
+        exact += bool(abs(true - gains[k]) < 1e-6 * at.squared)
+    assert exact > len(tets) / 4
 
 
 def test_only_those_that_promise_most_are_looked_at(state: tuple[Equilibria, Design, np.ndarray]) -> None:
     equilibria, design, tets = state
-    whole = influence(equilibria, design, tets, SCALE)
-    few = influence(equilibria, design, tets, SCALE, most=5)
+    whole = influence(equilibria, design, tets, WEIGHTS)
+    few = influence(equilibria, design, tets, WEIGHTS, most=5)
     assert len(few.tets) == 5
     rows = np.searchsorted(whole.tets, few.tets)
     np.testing.assert_allclose(few.change, whole.change[rows], atol=1e-9 * np.abs(whole.change).max())
