@@ -40,8 +40,9 @@ HELD_DAMPING = 0.03
 # The whole surface is followed where the changes of all measures by all flips are at most so many numbers; else the
 # error in polynomials of this degree and in its own direction.
 MOST_NUMBERS, MODE_DEGREE = 30_000_000, 3
-# Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest.
-NEAR_LIMIT, MOST_LIMITS = 0.75, 300
+# Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest, or so few
+# where each takes a solution.
+NEAR_LIMIT, MOST_LIMITS, FEW_LIMITS = 0.75, 300, 40
 # The held positions settle among limits in so many tries of which of them hold back.
 MOST_ACTIVE_SETS = 10
 # How little a flip's worth follows what is seen of many.
@@ -267,15 +268,16 @@ def influence(
         along_error = gradients(_measured(e, rigid, None)[:, None], np.maximum(limits.values, 0)[:, None])
         promise, _ = _in_modes(lin, _loads(equilibria, design, lin, tets), len(tets), along_error)
         tets = np.sort(tets[np.argsort(promise[:, 0], kind="stable")[:most]])
-    basis, loads, count = None, _loads(equilibria, design, lin, tets), len(limits.values)
-    if len(tets) * (len(on_surface) + count) <= MOST_NUMBERS:
+    basis, loads = None, _loads(equilibria, design, lin, tets)
+    if len(tets) * (len(on_surface) + len(limits.values)) <= MOST_NUMBERS:
         change, by_held = _on_the_surface(lin, loads, len(tets), on_surface, root, rigid, limits)
     else:
-        basis = _smooth_modes(problem, root, rigid, e, on_surface)
+        limits = limits_near(equilibria, design, weights, FEW_LIMITS)
+        basis, count = _smooth_modes(problem, root, rigid, e, on_surface), len(limits.values)
         modes = np.hstack([basis, np.zeros((len(basis), count))])
         each_limit = np.hstack([np.zeros((count, basis.shape[1])), np.eye(count)])
         change, by_held = _in_modes(lin, loads, len(tets), gradients(modes, each_limit))
-    width = change.shape[1] - count
+    width = change.shape[1] - len(limits.values)
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
     gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
     view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)

@@ -30,7 +30,7 @@ STEPS_AFTER_EXCHANGE = 2
 # surface and creases it at the rim.
 LARGEST_TRACTION = 0.25
 # While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
-ROUNDING_LOSS = 2.5
+ROUNDING_LOSS = 1.5
 # While there is too much SMP, its price grows by this power of the growth of lam_round.
 DEARER = 0.86
 # So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
