@@ -19,6 +19,11 @@ from fab4d.solvers._row_kernels import largest_entries
 from fab4d.solvers.nested_dissection import nested_dissection
 from fab4d.solvers.threads import THREADED_FROM, usable_cores
 
+# Not only where it is used: its allocator takes the thread that loads it for one that never ends, and crashes after its
+# end (microsoft/mimalloc issue 1287).
+if find_spec("rslab"):
+    import rslab
+
 BACKENDS = ("rslab", "splu")
 # Forces one backend where the caller of `analyse` names none.
 BACKEND_VARIABLE = "FAB4D_LINEAR_BACKEND"
@@ -198,8 +203,6 @@ class _RegularisedFactor(_RslabFactor):
 
 class _RslabAnalysis:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int | None = None) -> None:
-        import rslab
-
         n = len(indptr) - 1
         pattern = csc_array((np.ones(len(indices)), indices, indptr), shape=(n, n))
         usual = usable_cores() if n >= THREADED_FROM else 1

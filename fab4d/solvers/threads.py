@@ -2,7 +2,9 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
+from threading import local
 from typing import TypeVar
 
 Result = TypeVar("Result")
@@ -21,10 +23,26 @@ def usable_cores() -> int:
 def side_by_side(calls: Sequence[Callable[[], Result]], n_unknowns: int) -> list[Result]:
     """The results of calls that do not depend on each other, in their order.
 
-    One after the other where factorisations of n_unknowns take all cores themselves. What a call raises is raised.
+    One after the other where factorisations of n_unknowns take all cores themselves, and within such a call. What one
+    raises is raised once all have ended.
     """
     workers = min(usable_cores(), len(calls))
-    if workers < 2 or n_unknowns >= THREADED_FROM:
+    if workers < 2 or n_unknowns >= THREADED_FROM or getattr(_here, "works", False):
         return [call() for call in calls]
-    with ThreadPoolExecutor(workers) as threads:
-        return [each.result() for each in [threads.submit(call) for call in calls]]
+    threads = _threads(usable_cores())
+    started = [threads.submit(call) for call in calls]
+    wait(started)
+    return [each.result() for each in started]
+
+
+_here = local()
+
+
+def _works() -> None:
+    _here.works = True
+
+
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    """Threads that are kept: ends of threads are what memory allocators of libraries fail at."""
+    return ThreadPoolExecutor(count, initializer=_works)

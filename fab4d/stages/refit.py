@@ -129,6 +129,8 @@ def _followed(equilibria: Equilibria, before: Design, smp: BoolArray, weights: O
         design = change_density(equilibria, before, smp.astype(np.float64))
     except EquilibriumError:
         return None
+    if not equilibria.patches.count:
+        return _Printed(design, design)
     return _Printed(design, refit(equilibria, design, weights, lambda at: None, iterations=FEW_STEPS))  # noqa: ARG005
 
 

@@ -1,7 +1,10 @@
 """Independent computations side by side."""
 
 import os
+import subprocess
+import sys
 import threading
+import time
 
 import pytest
 
@@ -48,3 +51,53 @@ def test_what_a_call_raises_is_raised(cores):
 
     with pytest.raises(ZeroDivisionError):
         side_by_side([lambda: 1, fails], 1)
+
+
+def test_calls_within_calls_do_not_wait_for_threads_that_wait_for_them(cores):
+    cores(2)
+
+    def outer(name: str) -> list[str]:
+        return side_by_side([lambda: name + "1", lambda: name + "2"], 1)
+
+    assert side_by_side([lambda: outer("a"), lambda: outer("b"), lambda: outer("c")], 1) == [
+        ["a1", "a2"],
+        ["b1", "b2"],
+        ["c1", "c2"],
+    ]
+
+
+def test_all_calls_have_ended_when_one_raises(cores):
+    cores(2)
+    ended = []
+
+    def slow() -> None:
+        time.sleep(0.2)
+        ended.append(True)
+
+    def fails() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        side_by_side([fails, slow], 1)
+    assert ended
+
+
+def test_systems_are_first_solved_in_threads_that_end():
+    """In a new process: the allocator of rslab crashed in the second thread where the first one had loaded it."""
+    code = """
+import threading, numpy as np
+from fab4d.solvers.linear import analyse
+from fab4d.solvers.threads import side_by_side
+n = 300
+indptr, indices = np.r_[np.arange(0, 2 * n, 2), 2 * n - 1], np.column_stack([np.arange(n), np.arange(1, n + 1)]).ravel()
+data = np.tile([2.5, -1.0], n)[: 2 * n - 1]
+def solve():
+    analyse(indptr, indices[: 2 * n - 1]).factor(data).solve_many(np.ones((n, 3)))
+for _ in range(20):
+    one = threading.Thread(target=solve)
+    one.start()
+    one.join()
+    side_by_side([solve, solve, solve], n)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
