@@ -9,7 +9,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import FlipSettings, compensated, polish_labels
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -41,6 +41,8 @@ ALLOWED_LOSS = 1.15
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
+# Share of the way to labels that are hard to come to that a step may come down to.
+PATIENT_STEP = 1e-3
 Polish = Callable[[Design], Design]
 
 
@@ -118,15 +120,24 @@ def _printed_design(
     calls = [partial(_followed, equilibria, before, labels, weights) for labels in wanted]
     found = [each for each in side_by_side(calls, 3 * problem.n_nodes) if each is not None]
     if not found:
+        followed = _followed(equilibria, before, smp, weights, patient=True)
+        found = [] if followed is None else [followed]
+    if not found:
         design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
         return _Printed(design, design)
     return min(found, key=lambda each: shape_error(problem, each.fitted.final.y).rms)
 
 
-def _followed(equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights) -> _Printed | None:
-    """The labels smp (m,); None where no path of equilibria leads to them."""
+def _followed(
+    equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights, patient: bool = False
+) -> _Printed | None:
+    """The labels smp (m,); None where no path of equilibria leads to them.
+
+    patient : whether small steps are made too and the path may lead past unstable states, which takes minutes
+    """
+    smallest = PATIENT_STEP if patient else SMALLEST_STEP
     try:
-        design = change_density(equilibria, before, smp.astype(np.float64))
+        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient)
     except EquilibriumError:
         return None
     if not equilibria.patches.count:
