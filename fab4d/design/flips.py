@@ -135,10 +135,8 @@ def flip(
     labels, tets, volumes = labels.copy(), found.tets, problem.volume_fractions
     corners, pinching = problem.body.elements[tets, :4], np.zeros(len(tets), bool)
     least = LEAST_GAIN / fineness(problem)
-    done = (labels != before)[tets]
-    shape = found.shape + found.shape_change[done].sum(axis=0)
+    shape, beyond = found.measures((labels != before)[tets])
     slope, squared, toward = found.shape_change @ shape, float(shape @ shape), found.view.shape_by_held @ shape
-    beyond = found.beyond + found.limit_change[done].sum(axis=0)
     for _ in range(most):
         at = found.settled(squared, toward, beyond)
         sign = np.where((labels != before)[tets], -1.0, 1.0)

@@ -37,8 +37,8 @@ from fab4d.solvers.threads import side_by_side
 SHARE_LEFT = 0.8
 # Held positions follow as a Gauss-Newton step with this damping lets them.
 HELD_DAMPING = 0.03
-# The whole surface is followed where the changes of all measures by all flips are at most so many numbers; else the
-# error in polynomials of this degree and in its own direction.
+# The whole surface is followed where the changes of it by all flips are at most so many numbers; else the error in
+# polynomials of this degree and in its own direction.
 MOST_NUMBERS, MODE_DEGREE = 30_000_000, 3
 # Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest, or so few
 # where each takes a solution.
@@ -182,10 +182,14 @@ class Influence:
         """(k,) scalar products of all changes of the shape with the k-th."""
         return self.shape_change @ self.shape_change[k] if self.overlaps is None else self.overlaps[k]
 
+    def measures(self, flipped: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """(p,) of the shape and (l,) of the limits, with the tets `flipped` (k,) at fixed held positions."""
+        shape = self.shape + self.shape_change[flipped].sum(axis=0)
+        return shape, self.beyond + self.limit_change[flipped].sum(axis=0)
+
     def left(self, flipped: BoolArray) -> float:
         """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
-        shape = self.shape + self.shape_change[flipped].sum(axis=0)
-        beyond = self.beyond + self.limit_change[flipped].sum(axis=0)
+        shape, beyond = self.measures(flipped)
         return float(np.sqrt(self.settled(float(shape @ shape), self.view.shape_by_held @ shape, beyond).squared))
 
     def settled(self, squared: float, toward: FloatArray, beyond: FloatArray) -> Settled:
@@ -255,7 +259,9 @@ def influence(
     root = np.sqrt(areas[on_surface])
     rigid, _ = np.linalg.qr(root[:, None] * rigid_modes(y).reshape(-1, 6)[on_surface])
     e = _weighted_error(problem, y, on_surface, root)
-    limits = limits_near(equilibria, design, weights, MOST_LIMITS)
+    count = len(tets) if most is None else min(most, len(tets))
+    whole = count * len(on_surface) <= MOST_NUMBERS
+    limits = limits_near(equilibria, design, weights, MOST_LIMITS if whole else FEW_LIMITS)
     lin = linearise(equilibria, design.rho, design.median, design.final)
 
     def gradients(basis: FloatArray, of_limits: FloatArray) -> Gradients:
@@ -264,20 +270,19 @@ def influence(
         gy[on_surface] = root[:, None] * basis
         return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, gy)
 
-    if most is not None and len(tets) > most:
+    if len(tets) > count:
         along_error = gradients(_measured(e, rigid, None)[:, None], np.maximum(limits.values, 0)[:, None])
         promise, _ = _in_modes(lin, _loads(equilibria, design, lin, tets), len(tets), along_error)
-        tets = np.sort(tets[np.argsort(promise[:, 0], kind="stable")[:most]])
-    basis, loads = None, _loads(equilibria, design, lin, tets)
-    if len(tets) * (len(on_surface) + len(limits.values)) <= MOST_NUMBERS:
+        tets = np.sort(tets[np.argsort(promise[:, 0], kind="stable")[:count]])
+    basis, loads, n_limits = None, _loads(equilibria, design, lin, tets), len(limits.values)
+    if whole:
         change, by_held = _on_the_surface(lin, loads, len(tets), on_surface, root, rigid, limits)
     else:
-        limits = limits_near(equilibria, design, weights, FEW_LIMITS)
-        basis, count = _smooth_modes(problem, root, rigid, e, on_surface), len(limits.values)
-        modes = np.hstack([basis, np.zeros((len(basis), count))])
-        each_limit = np.hstack([np.zeros((count, basis.shape[1])), np.eye(count)])
+        basis = _smooth_modes(problem, root, rigid, e, on_surface)
+        modes = np.hstack([basis, np.zeros((len(basis), n_limits))])
+        each_limit = np.hstack([np.zeros((n_limits, basis.shape[1])), np.eye(n_limits)])
         change, by_held = _in_modes(lin, loads, len(tets), gradients(modes, each_limit))
-    width = change.shape[1] - len(limits.values)
+    width = change.shape[1] - n_limits
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
     gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
     view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)

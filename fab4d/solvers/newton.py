@@ -24,7 +24,8 @@ class Status(Enum):
 MAX_HALVINGS = 20
 # A guess may be unstable where the equilibrium near it is not. From this iteration on, an unstable state leads away.
 ASTRAY = 3
-# A step with an old factor costs about a sixth of one with a new factor, which leaves a hundredth of the residual.
+# Steps with an old factor are far cheaper than those with a new one, as long as each leaves this share of the residual
+# at most.
 CHORD_GAIN = 0.3
 
 

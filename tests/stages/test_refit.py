@@ -112,6 +112,42 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
         refit._printed_design(*given)
 
 
+def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only where no candidate is found at once; where loading from rest ends if there is no path at all."""
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    smp = inputs["rounded"]["smp"]
+    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
+    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    asked: list[bool] = []
+
+    def found_by(patience: set[bool]) -> Design:
+        asked.clear()
+
+        def hard(at: Equilibria, before: Design, rho: FloatArray, smallest: float, stay: bool) -> Design:
+            asked.append(not stay)
+            if asked[-1] not in patience:
+                msg = "none"
+                raise EquilibriumError(msg)
+            return change_density(at, before, rho, smallest, stay=stay)
+
+        monkeypatch.setattr(refit, "change_density", hard)
+        return refit._printed_design(equilibria, inputs["relaxed"], smp, weights, settings).design
+
+    at_once = found_by({False, True})
+    assert not any(asked)
+    patiently = found_by({True})
+    assert asked[-1]
+    assert not any(asked[:-1])
+    by_loading = found_by(set())
+    for each in (patiently, by_loading):
+        np.testing.assert_array_equal(each.rho, smp)
+    assert set(np.unique(at_once.rho)) == {0.0, 1.0}
+    assert rms(problem, by_loading) < 2 * rms(problem, patiently)
+
+
 def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     """Of labels that were spoilt: what is printed comes nearer than they do, or is they where flips mislead."""
     problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
