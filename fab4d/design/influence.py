@@ -1,21 +1,18 @@
 """What the other material in whole tets does to the final shape and to active limits, by linear algebra alone.
 
-A flip changes the stiffness of its tet many times over, so a derivative with respect to its density is off by as much.
-Here the tet takes its other material, to first order in the displacements but with its whole stiffness, while all
-other nodes stay where they are: a small dense system. The forces that it then exerts go through the factors of the
-whole part.
+The forces that flipped tets exert (`flip_loads.py`) go through the factors of the whole part.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import csc_array, csr_array, vstack
+from scipy.sparse import csr_array, vstack
 
 from fab4d.design.equilibria import Equilibria, Median
+from fab4d.design.flip_loads import FlipLoads, flip_loads
 from fab4d.design.gauss_newton import HELD_STEP, Design
 from fab4d.design.objective import (
     ObjectiveWeights,
@@ -26,15 +23,12 @@ from fab4d.design.objective import (
     stretch_excess,
 )
 from fab4d.design.problem import Problem
-from fab4d.design.sensitivity import Linearisation, element_dofs, force_columns, linearise
-from fab4d.elasticity import _kernels as kernels
-from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern
-from fab4d.materials.cards import Moduli
+from fab4d.design.sensitivity import Linearisation, linearise
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.solvers.threads import side_by_side
 
-# The nodes around a tet give way too, which leaves about this share of what it does among fixed ones.
-SHARE_LEFT = 0.8
+# Right-hand sides are made for so many flips at once.
+AT_ONCE = 256
 # Held positions follow as a Gauss-Newton step with this damping lets them.
 HELD_DAMPING = 0.03
 # The whole surface is followed where the changes of it by all flips are at most so many numbers; else the error in
@@ -47,8 +41,6 @@ NEAR_LIMIT, MOST_LIMITS, FEW_LIMITS = 0.75, 300, 40
 MOST_ACTIVE_SETS = 10
 # How little a flip's worth follows what is seen of many.
 TEACH_RIDGE = 0.1
-# Dense systems and right-hand sides are made for so many tets at once.
-AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +130,22 @@ class Settled:
 
 
 @dataclass(frozen=True, eq=False)
+class FlipEnergy:
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + price, of flips of tets (k,).
+
+    error (p,), changes (k, p) : of the shape        beyond (l,), limit_changes (k, l) : of the limits
+    price : of each flip, L0^2
+    """
+
+    tets: IntArray
+    error: FloatArray
+    changes: FloatArray
+    beyond: FloatArray
+    limit_changes: FloatArray
+    price: float
+
+
+@dataclass(frozen=True, eq=False)
 class Influence:
     """What flips of tets change of the error of a design, a vector whose length is its RMS error in L0, and of limits.
 
@@ -161,26 +169,6 @@ class Influence:
     def residual(self) -> FloatArray:
         """(p,) error of the shape, without what the held positions take away."""
         return self.view.without_held(self.shape)
-
-    @cached_property
-    def toward(self) -> FloatArray:
-        """(k, 3K) gradients by the held positions, to which each flip leads."""
-        return self.shape_change @ self.view.shape_by_held.T
-
-    @cached_property
-    def own(self) -> FloatArray:
-        """(k,) squares of the changes of the shape."""
-        return np.einsum("kp,kp->k", self.shape_change, self.shape_change)
-
-    @cached_property
-    def overlaps(self) -> FloatArray | None:
-        """(k, k) scalar products of the changes; None where these are shorter than they are many."""
-        many = len(self.tets) > self.shape_change.shape[1]
-        return None if many else self.shape_change @ self.shape_change.T
-
-    def along(self, k: int) -> FloatArray:
-        """(k,) scalar products of all changes of the shape with the k-th."""
-        return self.shape_change @ self.shape_change[k] if self.overlaps is None else self.overlaps[k]
 
     def measures(self, flipped: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(p,) of the shape and (l,) of the limits, with the tets `flipped` (k,) at fixed held positions."""
@@ -209,20 +197,19 @@ class Influence:
         squared += float(2 * toward @ moves + moves @ view.gram @ moves + (np.maximum(settled, 0) ** 2).sum())
         return Settled(max(squared, 0.0), settled, settled > 0, moves)
 
-    def gains(self, at: Settled, slope: FloatArray, sign: FloatArray) -> FloatArray:
-        """(k,) how far each flip lowers the squared error, held positions following.
+    def energy(self, flipped: BoolArray, price: float) -> "FlipEnergy":
+        """What flips cost where the tets `flipped` (k,) are flipped already. price : of a flip, in squared errors
 
-        slope (k,) : scalar products of the changes with the error of the shape before the held positions moved
-        sign (k,) : -1 for flips that are taken back
+        Held positions follow the shape alone: where limits hold them back the true error is smaller.
         """
-        view, active = self.view, at.active
-        by_held, change = view.limits_by_held[:, active], self.limit_change[:, active]
-        pull = self.toward + change @ by_held.T
-        followed = np.linalg.solve(view.gram + by_held @ by_held.T, pull.T).T
-        own = self.own + (change**2).sum(axis=1) - np.einsum("kc,kc->k", pull, followed)
-        first = slope + self.toward @ at.moves + change @ at.beyond[active]
-        others = at.beyond[~active] + sign[:, None] * self.limit_change[:, ~active]
-        return np.asarray(-2 * sign * first - own - (np.maximum(others, 0) ** 2).sum(axis=1), np.float64)
+        view, sign = self.view, np.where(flipped, -1.0, 1.0)[:, None]
+        shape, beyond = self.measures(flipped)
+        followed = np.linalg.solve(view.gram, view.limits_by_held)
+        beyond = beyond - shape @ view.shape_by_held.T @ followed
+        limit_changes = self.limit_change - self.shape_change @ view.shape_by_held.T @ followed
+        error = view.without_held(shape)
+        squared = float(error @ error + (np.maximum(beyond, 0) ** 2).sum())
+        return FlipEnergy(self.tets, error, sign * self.change, beyond, sign * limit_changes, price * squared)
 
     def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.
@@ -270,23 +257,24 @@ def influence(
         gy[on_surface] = root[:, None] * basis
         return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, gy)
 
+    loads = flip_loads(equilibria, design, lin, tets)
     if len(tets) > count:
         along_error = gradients(_measured(e, rigid, None)[:, None], np.maximum(limits.values, 0)[:, None])
-        promise, _ = _in_modes(lin, _loads(equilibria, design, lin, tets), len(tets), along_error)
-        tets = np.sort(tets[np.argsort(promise[:, 0], kind="stable")[:count]])
-    basis, loads, n_limits = None, _loads(equilibria, design, lin, tets), len(limits.values)
+        promise, _ = _in_modes(lin, loads, along_error)
+        kept = np.sort(np.argsort(promise[:, 0], kind="stable")[:count])
+        tets, loads = tets[kept], loads.of(kept)
+    basis, n_limits = None, len(limits.values)
     if whole:
-        change, by_held = _on_the_surface(lin, loads, len(tets), on_surface, root, rigid, limits)
+        change, by_held = _on_the_surface(lin, loads, on_surface, root, rigid, limits)
     else:
         basis = _smooth_modes(problem, root, rigid, e, on_surface)
         modes = np.hstack([basis, np.zeros((len(basis), n_limits))])
         each_limit = np.hstack([np.zeros((n_limits, basis.shape[1])), np.eye(n_limits)])
-        change, by_held = _in_modes(lin, loads, len(tets), gradients(modes, each_limit))
+        change, by_held = _in_modes(lin, loads, gradients(modes, each_limit))
     width = change.shape[1] - n_limits
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
     gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
     view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)
-    change *= SHARE_LEFT
     return Influence(tets, view.shape(problem, y), limits.values, change[:, :width], change[:, width:], view)
 
 
@@ -302,18 +290,8 @@ class Gradients:
     y: FloatArray
 
 
-# Each computes forces of some tets, and where these tets are among all.
-Loads = list[Callable[[], tuple[slice, csc_array, csc_array]]]
-
-
 def _on_the_surface(
-    lin: Linearisation,
-    loads: Loads,
-    n_tets: int,
-    on_surface: IntArray,
-    root: FloatArray,
-    rigid: FloatArray,
-    limits: Limits,
+    lin: Linearisation, loads: FlipLoads, on_surface: IntArray, root: FloatArray, rigid: FloatArray, limits: Limits
 ) -> tuple[FloatArray, FloatArray]:
     """Change (k, s + l) by each flip and derivative (3K, s + l) by the held positions, of the weighted boundary
     positions and of the limits."""
@@ -322,27 +300,25 @@ def _on_the_surface(
         shape = _measured((root[:, None] * dy[on_surface]).T, rigid, None)
         return np.hstack([shape, limits.changes(z).T])
 
+    n_tets = loads.hot.shape[1]
     change = np.zeros((n_tets, len(on_surface) + len(limits.values)))
 
-    def follow(load: Callable[[], tuple[slice, csc_array, csc_array]]) -> None:
-        part, hot, cold = load()
-        held = np.zeros((3 * lin.n_patches, hot.shape[1]))
-        change[part] = seen(*lin.respond(-np.vstack([hot.toarray(), held]), -cold.toarray()))
+    def follow(part: slice) -> None:
+        some = loads.of(part)
+        held = np.zeros((3 * lin.n_patches, some.hot.shape[1]))
+        change[part] = seen(*lin.respond(-np.vstack([some.hot.toarray(), held]), -some.cold.toarray()))
 
-    side_by_side([partial(follow, load) for load in loads], lin.M.shape[0])
+    parts = [slice(first, min(first + AT_ONCE, n_tets)) for first in range(0, n_tets, AT_ONCE)]
+    side_by_side([partial(follow, part) for part in parts], lin.M.shape[0])
     dx, df, dy = lin.held_columns()
     return change, seen(np.vstack([dx, df]), dy)
 
 
-def _in_modes(lin: Linearisation, loads: Loads, n_tets: int, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
+def _in_modes(lin: Linearisation, loads: FlipLoads, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
     """The same of measures with these gradients: a solution for each of them, not for each flip."""
     n = lin.M.shape[0]
     of_median, of_final = lin.adjoint_states(gradients.x, gradients.f, gradients.y)
-    change = np.zeros((n_tets, gradients.y.shape[1]))
-    for load in loads:
-        part, hot, cold = load()
-        change[part] = -(hot.T @ of_median[:n] + cold.T @ of_final)
-    return change, -of_median[n:]
+    return -(loads.hot.T @ of_median[:n] + loads.cold.T @ of_final), -of_median[n:]
 
 
 def _smooth_modes(
@@ -376,116 +352,3 @@ def _polynomials(X: FloatArray, degree: int) -> FloatArray:
     powers = [c for d in range(degree + 1) for c in combinations_with_replacement(range(3), d)]
     monomials = np.column_stack([centred[:, c].prod(axis=1) if c else np.ones(len(X)) for c in map(list, powers)])
     return np.kron(monomials, np.eye(3))
-
-
-# -- from flips to loads
-
-
-def _loads(equilibria: Equilibria, design: Design, lin: Linearisation, tets: IntArray) -> Loads:
-    """Forces of flipped tets on the hot and the cold part, as columns (3N, k) of some tets after others."""
-    problem = equilibria.problem
-    hot_tangent = equilibria.median_tangent(design.rho, design.median.x)
-    cold_tangent = equilibria.final_tangent(design.rho, design.median, design.final.y)
-    cold_mask = equilibria.free_mask(design.final.y)
-
-    def load(part: slice) -> tuple[slice, csc_array, csc_array]:
-        some = tets[part]
-        around_hot = _compliance(equilibria.held_pattern, hot_tangent, equilibria.held_mask, equilibria, some)
-        around_cold = _compliance(equilibria.free_pattern, cold_tangent, cold_mask, equilibria, some)
-        mixed = _between_nodes(equilibria, lin, some)
-        hot, cold = flip_forces(equilibria, design, some, around_hot, around_cold, mixed)
-        elements, n_nodes = problem.body.elements[some], problem.n_nodes
-        return part, force_columns(elements, hot, n_nodes), force_columns(elements, cold, n_nodes)
-
-    firsts = range(0, len(tets), AT_ONCE)
-    return [partial(load, slice(first, min(first + AT_ONCE, len(tets)))) for first in firsts]
-
-
-def flip_forces(
-    equilibria: Equilibria,
-    design: Design,
-    tets: IntArray,
-    around_hot: FloatArray,
-    around_cold: FloatArray,
-    mixed: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """What tets (k,) with their other material change of the nodal forces (k, 3nn) in the median and final shape.
-
-    around_hot, around_cold (k, 3nn, 3nn) : compliance of the nodes of each tet in the two shapes
-    mixed (k, 3nn, 3nn) : derivative of their forces in the final shape by their positions in the median shape
-
-    With the change s of the density, k the tangent and r the force of the new material less those of the old one, and C
-    the compliance, the tet's nodes move by -C f for the force f = s (r - k C f) that they get.
-    """
-    problem, x, y = equilibria.problem, design.median.x, design.final.y
-    body, gradients = problem.body, design.median.gradients
-    rho = design.rho[tets]
-    s = np.where(rho > 0.5, -rho, 1 - rho)
-    tpe, glassy = (body.dN, problem.tpe, y - body.X), (gradients, problem.glassy, y - x)
-    hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
-    r, k = _force_and_tangent(equilibria, tets, body.dN, hot, x - body.X)
-    f_hot = _condensed(s[:, None] * r, s[:, None, None] * k, around_hot)
-    moved = -np.einsum("kij,kj->ki", around_hot, f_hot)
-    r, k = (
-        a - b
-        for a, b in zip(
-            _force_and_tangent(equilibria, tets, *glassy), _force_and_tangent(equilibria, tets, *tpe), strict=True
-        )
-    )
-    r += np.einsum("kij,kj->ki", _mixed_blocks(equilibria, tets, gradients, problem.glassy, y - x), moved)
-    r -= np.einsum("kij,kjl,klm,km->ki", k, around_cold, mixed, moved, optimize=True)
-    return f_hot, _condensed(s[:, None] * r, s[:, None, None] * k, around_cold)
-
-
-def _condensed(r: FloatArray, k: FloatArray, C: FloatArray) -> FloatArray:
-    """f (k, n) with f = r - k C f."""
-    return np.asarray(np.linalg.solve(np.eye(r.shape[1]) + k @ C, r[:, :, None])[:, :, 0], np.float64)
-
-
-def _force_and_tangent(
-    equilibria: Equilibria, tets: IntArray, dN: FloatArray, moduli: Moduli, u: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Nodal forces (k, 3nn) and tangent (k, 3nn, 3nn) of tets of one material."""
-    body, ones = equilibria.problem.body, np.ones(len(tets))
-    elements, weights = body.elements[tets], body.weights[tets]
-    forces = np.zeros((*elements.shape, 3))
-    kernels.element_forces(elements, dN[tets], weights, moduli.mu * ones, moduli.kappa * ones, u, forces)
-    blocks = np.zeros((*elements.shape, elements.shape[1], 3, 3))
-    kernels.element_tangents(elements, dN[tets], weights, moduli.mu * ones, moduli.kappa * ones, u, blocks)
-    return forces.reshape(len(tets), -1), _square(blocks)
-
-
-def _mixed_blocks(equilibria: Equilibria, tets: IntArray, dN: FloatArray, moduli: Moduli, u: FloatArray) -> FloatArray:
-    """(k, 3nn, 3nn) derivative of the forces of glassy tets by their positions in the median shape."""
-    body, ones = equilibria.problem.body, np.ones(len(tets))
-    elements = body.elements[tets]
-    blocks = np.zeros((*elements.shape, elements.shape[1], 3, 3))
-    kernels.mixed(elements, dN[tets], body.weights[tets], moduli.mu * ones, moduli.kappa * ones, u, blocks)
-    return _square(blocks)
-
-
-def _compliance(
-    pattern: SymmetricPattern, tangent: FloatArray, mask: DirichletMask, equilibria: Equilibria, tets: IntArray
-) -> FloatArray:
-    """(k, 3nn, 3nn) how the nodes of each tet move by forces on them while all others stay; zero at fixed dofs."""
-    elements = equilibria.problem.body.elements[tets]
-    blocks = np.zeros((*elements.shape, elements.shape[1], 3, 3))
-    kernels.gather_blocks(elements, pattern.rank[tets], pattern.indptr, tangent, blocks)
-    free = np.ones(pattern.n_dofs)
-    free[mask.fixed] = 0.0
-    moves = free[element_dofs(elements)]
-    return np.linalg.inv(_square(blocks)) * moves[:, :, None] * moves[:, None, :]
-
-
-def _between_nodes(equilibria: Equilibria, lin: Linearisation, tets: IntArray) -> FloatArray:
-    """(k, 3nn, 3nn) the blocks of M between the nodes of each tet."""
-    elements, n = equilibria.problem.body.elements[tets], equilibria.problem.n_nodes
-    rows = np.repeat(np.arange(n), np.diff(lin.M.indptr))
-    place = np.searchsorted(rows * n + lin.M.indices, elements[:, :, None] * n + elements[:, None, :])
-    return _square(lin.M.data[place])
-
-
-def _square(blocks: FloatArray) -> FloatArray:
-    """(k, 3nn, 3nn) matrices of blocks (k, nn, nn, 3, 3)."""
-    k, nn = blocks.shape[:2]
-    return blocks.transpose(0, 1, 3, 2, 4).reshape(k, 3 * nn, 3 * nn)

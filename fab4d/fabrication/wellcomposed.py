@@ -9,12 +9,10 @@ search ends. What it leaves, if anything, is removed by flips of one label only,
 at the worst one material is left.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from fab4d.fabrication._links import Links, links_of, split_fans
-from fab4d.fabrication._repair_kernels import FREE, Queue, Scratch, State, all_defects, harmless_flip, search
+from fab4d.fabrication._repair_kernels import FREE, Queue, Scratch, State, all_defects, search
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 LONGEST_EXCURSION = 50
@@ -39,8 +37,7 @@ def well_composed(tets: IntArray, smp: BoolArray, flip_cost: FloatArray) -> Bool
     A place where the whole part itself is pinched is no matter of labels: the fans of tets that meet there are made
     well composed each for itself, and around a vertex that is still pinched then all tets become one material.
     """
-    links = links_of(split_fans(tets))
-    scratch = _scratch(links)
+    links, scratch = link_tables(tets)
     nowhere = np.zeros(len(links.n_nodes), bool)
     pinched = all_defects(nowhere, np.ones(len(tets), bool), links, scratch) > 0
     state = _state(smp, smp, flip_cost, pinched, FREE, links, scratch)
@@ -50,15 +47,10 @@ def well_composed(tets: IntArray, smp: BoolArray, flip_cost: FloatArray) -> Bool
     return _one_way(state, links, scratch)
 
 
-def flip_check(tets: IntArray) -> Callable[[BoolArray, int], bool]:
-    """A function of labels (m,) and a tet that tells whether flipping the tet pinches no boundary.
-
-    The tables of the mesh `tets` (m, 4) are built once.
-    """
+def link_tables(tets: IntArray) -> tuple[Links, Scratch]:
+    """The tables of the mesh `tets` (m, 4), each fan of tets by itself, and work space for kernels that walk them."""
     links = links_of(split_fans(tets))
-    scratch = _scratch(links)
-    nowhere = np.zeros(len(links.n_nodes), bool)
-    return lambda smp, tet: bool(harmless_flip(tet, nowhere, smp, links, scratch))
+    return links, _scratch(links)
 
 
 def _one_way(state: State, links: Links, scratch: Scratch) -> BoolArray:

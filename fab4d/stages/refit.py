@@ -17,8 +17,8 @@ from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, change_density, polished, refit
 from fab4d.errors import EquilibriumError
+from fab4d.fabrication.annealing import annealer
 from fab4d.fabrication.labels import smp_clusters
-from fab4d.fabrication.wellcomposed import flip_check
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
@@ -219,7 +219,7 @@ def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Go
     volumes = np.abs(tet_volumes(X, tets))
     return FlipSettings(
         printable=lambda smp: labels_for(X, tets, smp.astype(np.float64), volumes, printer).smp,
-        flippable=flip_check(tets),
+        annealed=annealer(tets, volumes / volumes.sum()),
         target_rms=target_rms,
         max_smp_fraction=1.0 if goal.max_smp_fraction is None else goal.max_smp_fraction,
     )

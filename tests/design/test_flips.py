@@ -15,17 +15,34 @@ from fab4d.design.flips import (
     compensated,
     error_left,
     flip,
+    near_interface,
     polish_labels,
 )
 from fab4d.design.gauss_newton import Design, equilibrate, held_positions
-from fab4d.design.influence import Influence, influence
+from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
+from fab4d.fabrication.annealing import annealer
 from fab4d.mesh.rigid import best_rigid_motion
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3)
-FREELY = FlipSettings(printable=lambda smp: smp, flippable=lambda smp, tet: True, target_rms=0.0)  # noqa: ARG005
+
+
+def freely(problem: Problem) -> FlipSettings:
+    """All labels can be printed that pinch nothing."""
+    annealed = annealer(problem.body.elements[:, :4], problem.volume_fractions)
+    return FlipSettings(printable=lambda smp: smp, annealed=annealed, target_rms=0.0)
+
+
+def recording(settings: FlipSettings, energies: list[FlipEnergy]) -> FlipSettings:
+    """The same, each energy added to the list."""
+
+    def annealed(labels: np.ndarray, energy: FlipEnergy, *rest: float) -> np.ndarray:
+        energies.append(energy)
+        return settings.annealed(labels, energy, *rest)
+
+    return replace(settings, annealed=annealed)
 
 
 def at_all_tets(equilibria: Equilibria, design: Design) -> Influence:
@@ -50,7 +67,9 @@ def test_labels_that_were_spoilt_are_made_good_again() -> None:
     start = equilibrate(at, spoilt.astype(float), held, truth.median.x, truth.median.forces, truth.final.y)
     assert start is not None
     shown: list[float] = []
-    end = polish_labels(at, start, WEIGHTS, FREELY, lambda s: shown.append(shape_error(problem, s.design.final.y).rms))
+    end = polish_labels(
+        at, start, WEIGHTS, freely(problem), lambda s: shown.append(shape_error(problem, s.design.final.y).rms)
+    )
     before, after = (shape_error(problem, d.final.y).rms for d in (start, end))
     assert after < 0.5 * before
     assert set(np.unique(end.rho)) == {0.0, 1.0}
@@ -70,28 +89,29 @@ def test_nothing_is_flipped_at_the_target_or_where_nothing_may_be() -> None:
     equilibria = two_patches(problem)
     design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
     for settings in (
-        FlipSettings(FREELY.printable, FREELY.flippable, target_rms=1.0),
-        FlipSettings(FREELY.printable, lambda smp, tet: False, target_rms=0.0),  # noqa: ARG005
+        replace(freely(problem), target_rms=1.0),
+        replace(freely(problem), annealed=lambda labels, *rest: labels),  # noqa: ARG005
+        replace(freely(problem), printable=lambda smp: design.rho > 0.5),  # noqa: ARG005
     ):
         same = polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
         np.testing.assert_array_equal(same.rho, design.rho)
 
 
-def test_fewer_flips_are_tried_where_many_have_no_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flips_become_dearer_where_they_have_no_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = bar(degrees=30.0)
-    equilibria, tried = two_patches(problem), []
+    equilibria, energies = two_patches(problem), list[FlipEnergy]()
     design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
 
     def lost(at: Equilibria, before: Design, rho: np.ndarray, smallest: float, stay: bool) -> Design:  # noqa: ARG001
-        tried.append(int(np.abs(rho - before.rho).sum()))
         msg = "none"
         raise EquilibriumError(msg)
 
     monkeypatch.setattr(flips, "change_density", lost)
-    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    same = polish_labels(equilibria, design, WEIGHTS, recording(freely(problem), energies), lambda at: None)  # noqa: ARG005
     assert same is design
-    assert 1 < len(tried) < 5
-    assert all(after < before for before, after in itertools.pairwise(tried))
+    assert len(energies) == flips.MOST_POOR
+    for before, after in itertools.pairwise(energies):
+        assert after.price == pytest.approx(flips.DEARER * before.price)
 
 
 def test_a_part_without_smp_is_left_as_it_is() -> None:
@@ -99,32 +119,32 @@ def test_a_part_without_smp_is_left_as_it_is() -> None:
     problem = bar(degrees=30.0)
     equilibria = two_patches(problem)
     design = held_design(equilibria, np.zeros(problem.n_tets), problem.X_temp)
-    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    same = polish_labels(equilibria, design, WEIGHTS, freely(problem), lambda at: None)  # noqa: ARG005
     assert not same.rho.any()
 
 
-def test_flips_stay_at_the_interface_and_within_the_share_of_smp() -> None:
+def test_flips_keep_to_the_share_of_smp() -> None:
     problem = bar(degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)
     found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
-    first = flip(problem, found, smp, smp, FREELY, 1) != smp
-    assert first.sum() == 1
-    assert at_interface(problem, smp)[first].all()
-    assert (flip(problem, found, smp, smp, FREELY, 30) & ~smp).any()
-    full = replace(FREELY, max_smp_fraction=0.0)
-    fewer = flip(problem, found, smp, smp, full, 30)
-    assert (fewer != smp).any()
-    assert smp[fewer].all()
+    volumes, half = problem.volume_fractions, float(problem.volume_fractions @ smp)
+    assert (flip(problem, found, smp, smp, freely(problem), 0.0, 500) & ~smp).any()
+    for share in (0.0, half + 1e-9, half + 0.02):
+        settings = replace(freely(problem), max_smp_fraction=share)
+        flipped = flip(problem, found, smp, smp, settings, 0.0, 500)
+        assert (flipped != smp).any()
+        assert volumes @ flipped <= max(share, half)
 
 
-def test_flips_that_are_chosen_lower_the_predicted_error() -> None:
+def test_flips_lower_the_predicted_error_and_fewer_are_made_where_they_are_dear() -> None:
     problem = bar(cells=(6, 3, 2), degrees=30.0)
     equilibria, smp = two_patches(problem), upper_half(problem)
     found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
-    left = [error_left(found, smp, flip(problem, found, smp, smp, FREELY, most)) for most in range(6)]
-    assert left == sorted(left, reverse=True)
-    assert left[0] == pytest.approx(np.linalg.norm(found.residual), rel=0.05)
-    assert left[5] < left[0]
+    made = [flip(problem, found, smp, smp, freely(problem), price, 500) for price in (0.0, 1e-2, 10.0)]
+    left, count = [error_left(found, smp, each) for each in made], [int((each != smp).sum()) for each in made]
+    assert left[0] < left[1] < left[2]
+    assert count[0] > count[1] > count[2] == 0
+    assert left[2] == pytest.approx(np.linalg.norm(found.residual), rel=0.05)
 
 
 def test_a_repair_is_made_up_for() -> None:
@@ -134,13 +154,14 @@ def test_a_repair_is_made_up_for() -> None:
     found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
     repair = smp.copy()
     repair[np.flatnonzero(at_interface(problem, smp))[::5]] ^= True
-    better = compensated(problem, found, smp, repair, FREELY)
+    better = compensated(problem, found, smp, repair, freely(problem))
     assert error_left(found, smp, better) < 0.9 * error_left(found, smp, repair)
 
     def bad(smp: np.ndarray) -> np.ndarray:
         return ~smp
 
-    np.testing.assert_array_equal(compensated(problem, found, smp, repair, replace(FREELY, printable=bad)), repair)
+    kept = compensated(problem, found, smp, repair, replace(freely(problem), printable=bad))
+    np.testing.assert_array_equal(kept, repair)
 
 
 def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,28 +177,32 @@ def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(flips, "change_density", worse)
     monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
-    same = polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
+    same = polish_labels(equilibria, design, WEIGHTS, freely(problem), lambda at: None)  # noqa: ARG005
     assert same is design
     assert 1 < len(tried) <= flips.MOST_POOR
     assert len(set(tried)) == len(tried)
 
 
-def test_of_smaller_tets_more_are_flipped_for_less_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_smaller_tets_more_are_candidates_for_less_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the bar's tets were four times as many as usual."""
     problem = bar(cells=(6, 3, 2), degrees=30.0)
-    equilibria, smp = two_patches(problem), upper_half(problem)
-    design = held_design(equilibria, smp.astype(float), problem.X_temp)
-    found = at_all_tets(equilibria, design)
-    monkeypatch.setattr(flips, "LEAST_GAIN", 0.03)
-    few = flip(problem, found, smp, smp, FREELY, 1000) != smp
-    asked: list[int] = []
+    equilibria, energies = two_patches(problem), list[FlipEnergy]()
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    monkeypatch.setattr(flips, "MOST_CANDIDATES", 10)
+    for usual in (problem.n_tets, problem.n_tets / 4):
+        monkeypatch.setattr(flips, "USUAL_TETS", usual)
+        settings = replace(recording(freely(problem), energies), rounds=1)
+        polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
+    usual, finer = energies
+    assert (len(usual.tets), len(finer.tets)) == (10, 40)
+    assert finer.price == pytest.approx(usual.price / 4)
 
-    def none_chosen(*args: object) -> np.ndarray:
-        asked.append(int(str(args[-1])))
-        return smp
 
-    monkeypatch.setattr(flips, "USUAL_TETS", problem.n_tets / 4)
-    assert (flip(problem, found, smp, smp, FREELY, 1000) != smp).sum() > 1.5 * few.sum()
-    monkeypatch.setattr(flips, "flip", none_chosen)
-    polish_labels(equilibria, design, WEIGHTS, FREELY, lambda at: None)  # noqa: ARG005
-    assert asked == [4 * flips.FIRST_BATCH]
+def test_near_the_interface_are_tets_with_an_edge_of_its_tets() -> None:
+    problem = bar(cells=(12, 2, 2))
+    corners = problem.body.elements[:, :4]
+    smp = problem.body.X[corners].mean(axis=1)[:, 0] > 0.5 * problem.body.X[:, 0].max()
+    vertices = set(corners[at_interface(problem, smp)].ravel().tolist())
+    expected = [len(vertices & set(tet)) >= 2 for tet in corners.tolist()]
+    np.testing.assert_array_equal(near_interface(problem, smp), expected)
+    assert 0 < np.mean(expected) < 1

@@ -1,13 +1,20 @@
-"""Meshes with labels: boxes of six tets a cell, irregular ones, and parts that touch themselves."""
+"""Meshes with labels: boxes of six tets a cell, irregular ones, and parts that touch themselves.
 
+Lets the tests import pinches.py beside this file, which is no package.
+"""
+
+import sys
 from collections.abc import Callable
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
 from fab4d.mesh.measures import tet_volumes
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
 KUHN = np.array([[0, 1 << a, (1 << a) + (1 << b), 7] for a, b, _ in permutations(range(3))])

@@ -1,59 +1,15 @@
 """After the repair every body is a 2-manifold, whatever the labels were."""
 
-from collections import Counter, defaultdict
 from time import process_time
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pinches import pinched_by_hand
 
-from fab4d.fabrication.wellcomposed import flip_check, pinched_vertices, well_composed
+from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
 from fab4d.mesh.measures import tet_volumes
-from fab4d.mesh.topology import TET_FACES
-
-
-def pinched_by_hand(tets, smp):
-    """The same question asked of the triangles one by one, in Python sets."""
-    pinched = set()
-    for label in (True, False):
-        faces = Counter(tuple(sorted(face)) for tet in tets[smp == label] for face in tet[TET_FACES].tolist())
-        links = defaultdict(list)
-        for face in (f for f, count in faces.items() if count == 1):
-            for v in face:
-                links[v].append([w for w in face if w != v])
-        pinched |= {v for v, edges in links.items() if not is_one_cycle(edges)}
-    return sorted(pinched)
-
-
-def is_one_cycle(edges):
-    neighbours = defaultdict(set)
-    for a, b in edges:
-        neighbours[a].add(b)
-        neighbours[b].add(a)
-    if any(len(n) != 2 for n in neighbours.values()):
-        return False
-    seen, waiting = set(), [edges[0][0]]
-    while waiting:
-        node = waiting.pop()
-        if node not in seen:
-            seen.add(node)
-            waiting += neighbours[node]
-    return len(seen) == len(neighbours)
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10**6), n_points=st.integers(0, 40))
-def test_a_flip_that_is_allowed_pinches_nothing(meshes, seed, n_points):
-    X, tets = meshes["irregular"](n_points, seed)
-    smp = repaired(X, tets, np.random.default_rng(seed).random(len(tets)) < 0.5)
-    allowed, answers = flip_check(tets), []
-    for tet in range(0, len(tets), 7):
-        flipped = smp.copy()
-        flipped[tet] ^= True
-        answers.append(allowed(smp, tet))
-        assert answers[-1] == (pinched_by_hand(tets, flipped) == [])
-    assert allowed(smp, 0) == answers[0]
 
 
 def repaired(X, tets, smp):

@@ -14,6 +14,7 @@ from fab4d.design.influence import influence
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.design.reduced import Search, at_rest
+from fab4d.fabrication.annealing import annealer
 from fab4d.mesh.measures import tet_volumes
 from fab4d.stages import _repair
 from fab4d.stages._design import problem_of
@@ -38,11 +39,13 @@ def found(mesh: dict[str, np.ndarray]) -> Search:
     return Search(equilibria, design)
 
 
-FLIPS = FlipSettings(
-    printable=lambda smp: smp,
-    flippable=lambda smp, tet: True,  # noqa: ARG005
-    target_rms=0.0,
-)
+@pytest.fixture(scope="module")
+def flips(mesh: dict[str, np.ndarray]) -> FlipSettings:
+    """All labels can be printed that pinch nothing."""
+    volumes = by_volume(mesh) / len(mesh["tets"])
+    return FlipSettings(printable=lambda smp: smp, annealed=annealer(mesh["tets"], volumes), target_rms=0.0)
+
+
 WEIGHTS = ObjectiveWeights(error_scale=5e-3)
 
 
@@ -56,31 +59,31 @@ def labels_by(mesh: dict[str, np.ndarray], found: Search, cost: np.ndarray) -> A
 
 
 def predicted(found: Search, repair: Repair) -> float:
-    flips = influence(found.equilibria, found.design, np.arange(len(repair.smp)), WEIGHTS)
-    return error_left(flips, found.design.rho > 0.5, repair.smp)
+    all_flips = influence(found.equilibria, found.design, np.arange(len(repair.smp)), WEIGHTS)
+    return error_left(all_flips, found.design.rho > 0.5, repair.smp)
 
 
 def test_the_repair_of_the_smallest_predicted_error_is_taken(
-    mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch
+    mesh: dict[str, np.ndarray], found: Search, flips: FlipSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of two, the second is taken where it promises clearly less."""
     away = ~at_interface(found.equilibria.problem, found.design.rho > 0.5)
     other = by_volume(mesh) * np.random.default_rng(1).lognormal(size=len(mesh["tets"])) * np.where(away, 1e3, 1.0)
     monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips, more: [other])  # noqa: ARG005
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", 0.0)
-    usual = repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS)
+    usual = repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS)
     np.testing.assert_allclose(usual.cost, by_volume(mesh))
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", np.inf)
-    second = repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS)
+    second = repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS)
     np.testing.assert_allclose(second.cost, other)
     ratio = predicted(found, second) / predicted(found, usual)
     for limit, expected in ((1.01 * ratio, second), (0.99 * ratio, usual)):
         monkeypatch.setattr(_repair, "CLEARLY_BETTER", limit)
-        np.testing.assert_array_equal(repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS).cost, expected.cost)
+        np.testing.assert_array_equal(repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS).cost, expected.cost)
 
 
 def test_no_repair_is_taken_whose_influence_is_not_known(
-    mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch
+    mesh: dict[str, np.ndarray], found: Search, flips: FlipSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inside = np.flatnonzero(~at_interface(found.equilibria.problem, found.design.rho > 0.5))
     assert len(inside)
@@ -98,24 +101,26 @@ def test_no_repair_is_taken_whose_influence_is_not_known(
     monkeypatch.setattr(_repair, "labels_for", deep)
     monkeypatch.setattr(_repair, "_other_costs", lambda cost, flips, more: [marked])  # noqa: ARG005
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", 1e9)
-    np.testing.assert_allclose(repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS).cost, by_volume(mesh))
+    np.testing.assert_allclose(repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS).cost, by_volume(mesh))
 
 
-def test_a_repair_is_made_up_for(mesh: dict[str, np.ndarray], found: Search, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repair_is_made_up_for(
+    mesh: dict[str, np.ndarray], found: Search, flips: FlipSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(_repair, "CLEARLY_BETTER", 0.0)
-    made = repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS)
+    made = repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS)
     plain = Repair(made.cost, labels_by(mesh, found, made.cost))
     assert predicted(found, made) < 0.9 * predicted(found, plain)
 
 
-def test_repairs_keep_to_the_share_of_smp(mesh: dict[str, np.ndarray], found: Search) -> None:
-    free = repaired(mesh, PROFILE["printer"], FLIPS, found, WEIGHTS)
+def test_repairs_keep_to_the_share_of_smp(mesh: dict[str, np.ndarray], found: Search, flips: FlipSettings) -> None:
+    free = repaired(mesh, PROFILE["printer"], flips, found, WEIGHTS)
     share = by_volume(mesh)[free.smp].sum() / len(mesh["tets"])
     least = by_volume(mesh)[labels_by(mesh, found, by_volume(mesh))].sum() / len(mesh["tets"])
-    kept = repaired(mesh, PROFILE["printer"], replace(FLIPS, max_smp_fraction=share - 0.02), found, WEIGHTS)
+    kept = repaired(mesh, PROFILE["printer"], replace(flips, max_smp_fraction=share - 0.02), found, WEIGHTS)
     assert by_volume(mesh)[kept.smp].sum() / len(mesh["tets"]) <= max(share - 0.02, least) + 1e-12
 
 
-def test_without_points_volumes_count(mesh: dict[str, np.ndarray]) -> None:
+def test_without_points_volumes_count(mesh: dict[str, np.ndarray], flips: FlipSettings) -> None:
     rest = at_rest(problem_of(mesh, PROFILE["materials"], "linear"))
-    np.testing.assert_allclose(repaired(mesh, PROFILE["printer"], FLIPS, rest, WEIGHTS).cost, by_volume(mesh))
+    np.testing.assert_allclose(repaired(mesh, PROFILE["printer"], flips, rest, WEIGHTS).cost, by_volume(mesh))

@@ -1,0 +1,125 @@
+"""Compiled simulated annealing of labels. `annealing.py` explains it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from fab4d.fabrication._links import Links
+from fab4d.fabrication._repair_kernels import Scratch, harmless_flip
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+# Steps at one temperature.
+SAME_TEMPERATURE = 256
+
+
+class Candidates(NamedTuple):
+    """Tets (k,) that may flip, their neighbours across faces (k, 4), -1 at the surface, and volumes (k,)."""
+
+    tets: IntArray
+    neighbours: IntArray
+    volumes: FloatArray
+
+
+class Squares(NamedTuple):
+    """`annealing.Energy` as the kernel changes it: error (p,) and beyond (l,) at the present labels.
+
+    gram (k, k) : scalar products of the changes; of size 0 where these are shorter than they are many
+    slope (k,) : scalar products of the changes with the error, where there is a gram
+    """
+
+    error: FloatArray
+    changes: FloatArray
+    gram: FloatArray
+    slope: FloatArray
+    beyond: FloatArray
+    limit_changes: FloatArray
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _rise(k: int, sign: float, squares: Squares) -> float:
+    """By how much the squares of the error grow with a flip, or with one taken back (sign -1)."""
+    if squares.gram.size:
+        return 2 * sign * squares.slope[k] + squares.gram[k, k]
+    slope = own = 0.0
+    for i in range(len(squares.error)):
+        slope += squares.changes[k, i] * squares.error[i]
+        own += squares.changes[k, i] * squares.changes[k, i]
+    return 2 * sign * slope + own
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _rise_of_limits(k: int, sign: float, squares: Squares) -> float:
+    rise = 0.0
+    for i in range(len(squares.beyond)):
+        before = max(squares.beyond[i], 0.0)
+        after = max(squares.beyond[i] + sign * squares.limit_changes[k, i], 0.0)
+        rise += after * after - before * before
+    return rise
+
+
+@njit(cache=True, nogil=True)
+def _take(k: int, sign: float, squares: Squares) -> None:
+    if squares.gram.size:
+        for j in range(len(squares.slope)):
+            squares.slope[j] += sign * squares.gram[k, j]
+    else:
+        for i in range(len(squares.error)):
+            squares.error[i] += sign * squares.changes[k, i]
+    for i in range(len(squares.beyond)):
+        squares.beyond[i] += sign * squares.limit_changes[k, i]
+
+
+@njit(cache=True, nogil=True)
+def _at_interface(k: int, smp: BoolArray, candidates: Candidates) -> bool:
+    found = False
+    for other in candidates.neighbours[k]:
+        found = found or (other >= 0 and smp[other] != smp[candidates.tets[k]])
+    return found
+
+
+@njit(cache=True, nogil=True)
+def anneal(
+    smp: BoolArray,
+    candidates: Candidates,
+    squares: Squares,
+    price: float,
+    room: float,
+    temperatures: tuple,
+    steps: int,
+    random: np.random.Generator,
+    links: Links,
+    scratch: Scratch,
+) -> BoolArray:
+    """Which candidates (k,) to flip; `smp` (m,) and `squares` are changed on the way.
+
+    price : of each flip        room : volume that may become SMP        temperatures : first and last
+    """
+    nowhere = np.zeros(len(links.n_nodes), np.bool_)
+    flipped = np.zeros(len(candidates.tets), np.bool_)
+    best = flipped.copy()
+    energy = least = 0.0
+    first, last = temperatures
+    temperature = first
+    for step in range(steps):
+        if step % SAME_TEMPERATURE == 0:
+            temperature = first * (last / first) ** (step / steps)
+        k = int(random.integers(0, len(flipped)))
+        sign = -1.0 if flipped[k] else 1.0
+        allowed = -temperature * np.log(1.0 - random.random())
+        rise = _rise(k, sign, squares) + sign * price
+        tet = candidates.tets[k]
+        if rise > allowed or not _at_interface(k, smp, candidates) or (not smp[tet] and candidates.volumes[k] > room):
+            continue
+        if len(squares.beyond):
+            rise += _rise_of_limits(k, sign, squares)
+        if rise > allowed or not harmless_flip(tet, nowhere, smp, links, scratch):
+            continue
+        _take(k, sign, squares)
+        room += candidates.volumes[k] if smp[tet] else -candidates.volumes[k]
+        smp[tet], flipped[k] = not smp[tet], not flipped[k]
+        energy += rise
+        if energy < least:
+            least = energy
+            best[:] = flipped
+    return best

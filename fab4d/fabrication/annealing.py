@@ -1,0 +1,76 @@
+"""Flips of tets that together lower an error most and pinch nothing.
+
+One flip after the other, each for the better, soon finds none that is allowed: most would pinch the boundary where they
+are, and others are needed first that make the error larger. Simulated annealing takes these too, the more rarely the
+lower the temperature (Kirkpatrick, Gelatt, Vecchi, Science 220 (1983) 671).
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from fab4d.fabrication._annealing_kernels import Candidates, Squares, anneal
+from fab4d.fabrication.features import tet_neighbours
+from fab4d.fabrication.wellcomposed import link_tables
+from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+
+# First and last temperature in squared errors of the labels to begin with.
+HOT, COLD = 1e-2, 1e-5
+
+
+class Energy(Protocol):
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + price of flips of tets (k,).
+
+    error (p,), changes (k, p) : of a shape        beyond (l,), limit_changes (k, l) : of limits that it should keep
+    price : of each flip
+    """
+
+    @property
+    def tets(self) -> IntArray: ...
+    @property
+    def error(self) -> FloatArray: ...
+    @property
+    def changes(self) -> FloatArray: ...
+    @property
+    def beyond(self) -> FloatArray: ...
+    @property
+    def limit_changes(self) -> FloatArray: ...
+    @property
+    def price(self) -> float: ...
+
+
+# Of labels (m,), the energy of flips, the volume that may become SMP, steps for each tet, and a seed.
+Annealed = Callable[[BoolArray, Energy, float, int, int], BoolArray]
+
+
+def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
+    """A function that finds the labels (m,) of least energy near given ones, no boundary pinched anew.
+
+    The tables of the mesh `tets` (m, 4) are built once. volumes (m,)
+    """
+    links, scratch = link_tables(tets)
+    neighbours = tet_neighbours(tets)
+
+    def annealed(labels: BoolArray, energy: Energy, room: float, steps: int, seed: int) -> BoolArray:
+        candidates = Candidates(energy.tets, neighbours[energy.tets], volumes[energy.tets])
+        squares = _squares(energy)
+        start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum())
+        flipped = anneal(
+            labels.copy(), candidates, squares, energy.price, room, (HOT * start, COLD * start),
+            steps * len(energy.tets), np.random.default_rng(seed), links, scratch,
+        )  # fmt: skip
+        result = labels.copy()
+        result[energy.tets[flipped]] ^= True
+        return result
+
+    return annealed
+
+
+def _squares(energy: Energy) -> Squares:
+    many = len(energy.tets) > energy.changes.shape[1]
+    gram = np.zeros((0, 0)) if many else energy.changes @ energy.changes.T
+    slope = energy.changes @ energy.error
+    changes = np.ascontiguousarray(energy.changes, dtype=np.float64)
+    limit_changes = np.ascontiguousarray(energy.limit_changes, dtype=np.float64)
+    return Squares(energy.error.copy(), changes, gram, slope, energy.beyond.copy(), limit_changes)

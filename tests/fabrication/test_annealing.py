@@ -1,0 +1,123 @@
+"""Annealed labels: the least energy of all that pinch nothing, found again by trying them all."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pinches import pinched_by_hand
+
+from fab4d.fabrication.annealing import annealer
+from fab4d.fabrication.features import tet_neighbours
+from fab4d.fabrication.wellcomposed import well_composed
+from fab4d.mesh.measures import tet_volumes
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    tets: np.ndarray
+    error: np.ndarray
+    changes: np.ndarray
+    beyond: np.ndarray
+    limit_changes: np.ndarray
+    price: float
+
+    def of(self, before: np.ndarray, labels: np.ndarray) -> float:
+        flipped = (labels != before)[self.tets]
+        error = self.error + self.changes[flipped].sum(axis=0)
+        beyond = self.beyond + self.limit_changes[flipped].sum(axis=0)
+        return float(error @ error + (np.maximum(beyond, 0) ** 2).sum() + self.price * flipped.sum())
+
+
+def energy_by_chance(tets: np.ndarray, seed: int, measures: int = 5, price: float = 1e-3) -> Energy:
+    """Two limits, of which one is kept to begin with."""
+    random = np.random.default_rng(seed)
+    changes, limit_changes = 0.05 * random.normal(size=(len(tets), measures)), 0.03 * random.normal(size=(len(tets), 2))
+    return Energy(tets, random.normal(size=measures), changes, np.array([0.05, -0.04]), limit_changes, price)
+
+
+def case(meshes, seed, n_points=20):
+    X, tets = meshes["irregular"](n_points, seed)
+    volumes = tet_volumes(X, tets)
+    smp = well_composed(tets, np.random.default_rng(seed).random(len(tets)) < 0.5, volumes)
+    return tets, volumes / volumes.sum(), smp
+
+
+def interface(tets, smp):
+    neighbours = tet_neighbours(tets)
+    return np.flatnonzero(((neighbours >= 0) & (smp[neighbours] != smp[:, None])).any(axis=1))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), n_points=st.integers(5, 40))
+def test_nothing_is_pinched_and_the_energy_falls(meshes, seed, n_points):
+    tets, volumes, smp = case(meshes, seed, n_points)
+    energy = energy_by_chance(np.arange(len(tets)), seed)
+    labels = annealer(tets, volumes)(smp, energy, 1.0, 50, seed)
+    assert pinched_by_hand(tets, labels) == []
+    assert energy.of(smp, labels) <= energy.of(smp, smp)
+
+
+def test_the_least_of_all_allowed_energies_is_found(meshes):
+    """Labels that single flips of tets at the interface lead to, none of them pinched: by going through them all."""
+    found = 0
+    for seed in range(12):
+        tets, volumes, smp = case(meshes, seed)
+        candidates = interface(tets, smp)[:8]
+        if len(candidates) < 8:
+            continue
+        energy = energy_by_chance(candidates, seed)
+        reached, waiting = {smp.tobytes(): smp}, [smp]
+        while waiting:
+            labels = waiting.pop()
+            at = set(interface(tets, labels).tolist())
+            for tet in candidates:
+                after = labels.copy()
+                after[tet] ^= True
+                if tet in at and after.tobytes() not in reached and pinched_by_hand(tets, after) == []:
+                    reached[after.tobytes()] = after
+                    waiting.append(after)
+        least = min(energy.of(smp, labels) for labels in reached.values())
+        labels = annealer(tets, volumes)(smp, energy, 1.0, 5000, 0)
+        assert energy.of(smp, labels) == pytest.approx(least)
+        found += least < energy.of(smp, smp)
+    assert found > 3
+
+
+def test_many_measures_and_few_come_to_the_same(meshes):
+    """The scalar products of the changes are kept or worked out each time."""
+    tets, volumes, smp = case(meshes, 3)
+    energy = energy_by_chance(np.arange(len(tets)), 3)
+    wide = np.zeros((len(tets), len(tets) + 1))
+    wide[:, : len(energy.error)] = energy.changes
+    padded = replace(energy, changes=wide, error=np.pad(energy.error, (0, wide.shape[1] - len(energy.error))))
+    few, many = (annealer(tets, volumes)(smp, each, 1.0, 200, 1) for each in (energy, padded))
+    np.testing.assert_array_equal(few, many)
+    assert (few != smp).any()
+
+
+def test_a_seed_gives_the_same_labels_again(meshes):
+    tets, volumes, smp = case(meshes, 5)
+    energy = energy_by_chance(np.arange(len(tets)), 5, measures=60)
+    annealed = annealer(tets, volumes)
+    before = smp.copy()
+    first, again, other = (annealed(smp, energy, 1.0, 1, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(smp, before)
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+@pytest.mark.parametrize(("room", "price"), [(0.0, 0.0), (0.0, 0.01), (0.01, 0.0), (0.01, 0.01)])
+def test_volume_that_may_become_smp_is_not_exceeded(meshes, room, price):
+    tets, volumes, smp = case(meshes, 7)
+    wanted = energy_by_chance(np.arange(len(tets)), 7, price=price)
+    labels = annealer(tets, volumes)(smp, wanted, room, 200, 0)
+    assert (labels != smp).any()
+    assert volumes @ labels <= volumes @ smp + room + 1e-12
+
+
+def test_nothing_is_flipped_that_costs_more_than_it_brings(meshes):
+    tets, volumes, smp = case(meshes, 7)
+    energy = energy_by_chance(np.arange(len(tets)), 7, price=1e3)
+    np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 0), smp)
