@@ -24,7 +24,7 @@ class Candidates(NamedTuple):
 class Squares(NamedTuple):
     """`annealing.Energy` as the kernel changes it: error (p,) and beyond (l,) at the present labels.
 
-    gram (k, k) : scalar products of the changes; of size 0 where these are shorter than they are many
+    gram (k, k) : scalar products of the changes; of size 0 where they are too many to be kept
     slope (k,) : scalar products of the changes with the error, where there is a gram
     """
 

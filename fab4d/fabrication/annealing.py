@@ -17,6 +17,10 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 # First and last temperature in squared errors of the labels to begin with.
 HOT, COLD = 1e-2, 1e-5
+# Scalar products of the changes of so many tets are kept at most; of more they are worked out each time.
+MOST_PRODUCTS = 4000
+# More steps than these take minutes.
+MOST_STEPS = 20_000_000
 
 
 class Energy(Protocol):
@@ -58,7 +62,7 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum())
         flipped = anneal(
             labels.copy(), candidates, squares, energy.price, room, (HOT * start, COLD * start),
-            steps * len(energy.tets), np.random.default_rng(seed), links, scratch,
+            min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed), links, scratch,
         )  # fmt: skip
         result = labels.copy()
         result[energy.tets[flipped]] ^= True
@@ -68,8 +72,8 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
 
 
 def _squares(energy: Energy) -> Squares:
-    many = len(energy.tets) > energy.changes.shape[1]
-    gram = np.zeros((0, 0)) if many else energy.changes @ energy.changes.T
+    few = len(energy.tets) <= MOST_PRODUCTS
+    gram = energy.changes @ energy.changes.T if few else np.zeros((0, 0))
     slope = energy.changes @ energy.error
     changes = np.ascontiguousarray(energy.changes, dtype=np.float64)
     limit_changes = np.ascontiguousarray(energy.limit_changes, dtype=np.float64)

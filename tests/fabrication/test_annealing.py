@@ -1,6 +1,6 @@
 """Annealed labels: the least energy of all that pinch nothing, found again by trying them all."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pinches import pinched_by_hand
 
+from fab4d.fabrication import annealing
 from fab4d.fabrication.annealing import annealer
 from fab4d.fabrication.features import tet_neighbours
 from fab4d.fabrication.wellcomposed import well_composed
@@ -85,16 +86,21 @@ def test_the_least_of_all_allowed_energies_is_found(meshes):
     assert found > 3
 
 
-def test_many_measures_and_few_come_to_the_same(meshes):
-    """The scalar products of the changes are kept or worked out each time."""
+def test_products_that_are_kept_and_those_worked_out_each_time_come_to_the_same(meshes, monkeypatch):
     tets, volumes, smp = case(meshes, 3)
     energy = energy_by_chance(np.arange(len(tets)), 3)
-    wide = np.zeros((len(tets), len(tets) + 1))
-    wide[:, : len(energy.error)] = energy.changes
-    padded = replace(energy, changes=wide, error=np.pad(energy.error, (0, wide.shape[1] - len(energy.error))))
-    few, many = (annealer(tets, volumes)(smp, each, 1.0, 200, 1) for each in (energy, padded))
-    np.testing.assert_array_equal(few, many)
-    assert (few != smp).any()
+    annealed = annealer(tets, volumes)
+    kept = annealed(smp, energy, 1.0, 200, 1)
+    monkeypatch.setattr(annealing, "MOST_PRODUCTS", 0)
+    np.testing.assert_array_equal(annealed(smp, energy, 1.0, 200, 1), kept)
+    assert (kept != smp).any()
+
+
+def test_there_is_an_end_to_the_steps(meshes, monkeypatch):
+    tets, volumes, smp = case(meshes, 3)
+    monkeypatch.setattr(annealing, "MOST_STEPS", 0)
+    energy = energy_by_chance(np.arange(len(tets)), 3)
+    np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 1), smp)
 
 
 def test_a_seed_gives_the_same_labels_again(meshes):
