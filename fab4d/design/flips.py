@@ -26,6 +26,8 @@ MOST_CANDIDATES = 1500
 FIRST_PRICE, CHEAPER, DEARER = 3e-4, 1.5, 3.0
 # By so much where no equilibrium tells whether it comes true.
 SURE_PRICE = 1e-3
+# A place that is pinched is worth this share to be mended.
+DEFECT_PRICE = 3e-3
 # A round has to lower the predicted squared error, and the objective, by this share.
 LEAST_ROUND_GAIN = 2e-2
 # Steps of the annealing for each candidate, in a round and where labels are compared.
@@ -47,7 +49,7 @@ Annealed = Callable[[BoolArray, FlipEnergy, float, int, int], BoolArray]
 @dataclass(frozen=True)
 class FlipSettings:
     """printable : labels near the given ones that can be printed
-    annealed : labels of less energy that pinch no more than the given ones
+    annealed : labels of less energy that pinch no more than the given ones, or less
 
     target_rms : RMS error, L0, at which nothing more is to be won        max_smp_fraction : of the volume
     """
@@ -103,6 +105,25 @@ def polish_labels(
     return refit(equilibria, design, weights, watch) if design is not start else start
 
 
+def mended(
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, settings: FlipSettings, steps: int
+) -> Design:
+    """The 0/1 design with places where its boundary is pinched mended by the flips that together cost least.
+
+    steps : of the held positions after it
+    It is left as it is where nothing can be mended, and where the labels have no stable equilibrium near.
+    """
+    problem, smp = equilibria.problem, design.rho > 0.5
+    tets = np.flatnonzero(near_interface(problem, smp))
+    if not equilibria.patches.count or not tets.size:
+        return design
+    found = influence(equilibria, design, tets, weights)
+    energy = found.energy(np.zeros(len(tets), bool), SURE_PRICE / fineness(problem), DEFECT_PRICE)
+    labels = settings.annealed(smp, energy, _room(problem, smp, settings), STEPS, 0)
+    changed = _changed(equilibria, design, labels) if (labels != smp).any() else None
+    return design if changed is None else refit(equilibria, changed, weights, lambda at: None, steps)  # noqa: ARG005
+
+
 def compensated(
     problem: Problem, found: Influence, before: BoolArray, smp: BoolArray, settings: FlipSettings
 ) -> BoolArray:
@@ -149,8 +170,12 @@ def flip(
     steps, seed : of the annealing, for each candidate
     """
     energy = found.energy((labels != before)[found.tets], price)
-    room = settings.max_smp_fraction - float(problem.volume_fractions @ labels)
-    return settings.annealed(labels, energy, room, steps, seed)
+    return settings.annealed(labels, energy, _room(problem, labels, settings), steps, seed)
+
+
+def _room(problem: Problem, labels: BoolArray, settings: FlipSettings) -> float:
+    """Share of the volume that may become SMP."""
+    return settings.max_smp_fraction - float(problem.volume_fractions @ labels)
 
 
 def near_interface(problem: Problem, labels: BoolArray) -> BoolArray:

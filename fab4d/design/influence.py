@@ -131,10 +131,10 @@ class Settled:
 
 @dataclass(frozen=True, eq=False)
 class FlipEnergy:
-    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + price, of flips of tets (k,).
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + prices, of flips of tets (k,).
 
     error (p,), changes (k, p) : of the shape        beyond (l,), limit_changes (k, l) : of the limits
-    price : of each flip, L0^2
+    price, defect_price : of each flip, and of each place that is left pinched, L0^2
     """
 
     tets: IntArray
@@ -143,6 +143,7 @@ class FlipEnergy:
     beyond: FloatArray
     limit_changes: FloatArray
     price: float
+    defect_price: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +198,8 @@ class Influence:
         squared += float(2 * toward @ moves + moves @ view.gram @ moves + (np.maximum(settled, 0) ** 2).sum())
         return Settled(max(squared, 0.0), settled, settled > 0, moves)
 
-    def energy(self, flipped: BoolArray, price: float) -> "FlipEnergy":
-        """What flips cost where the tets `flipped` (k,) are flipped already. price : of a flip, in squared errors
+    def energy(self, flipped: BoolArray, price: float, defect_price: float = 0.0) -> "FlipEnergy":
+        """What flips cost where the tets `flipped` (k,) are flipped already. Prices are in squared errors then.
 
         Held positions follow the shape alone: where limits hold them back the true error is smaller.
         """
@@ -209,7 +210,8 @@ class Influence:
         limit_changes = self.limit_change - self.shape_change @ view.shape_by_held.T @ followed
         error = view.without_held(shape)
         squared = float(error @ error + (np.maximum(beyond, 0) ** 2).sum())
-        return FlipEnergy(self.tets, error, sign * self.change, beyond, sign * limit_changes, price * squared)
+        prices = price * squared, defect_price * squared
+        return FlipEnergy(self.tets, error, sign * self.change, beyond, sign * limit_changes, *prices)
 
     def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from fab4d.fabrication._links import Links
-from fab4d.fabrication._repair_kernels import Scratch, harmless_flip
+from fab4d.fabrication._repair_kernels import Scratch, all_defects, vertex_defects
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 # Steps at one temperature.
@@ -79,11 +79,22 @@ def _at_interface(k: int, smp: BoolArray, candidates: Candidates) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _defects_left(tet: int, nowhere: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
+    """At the corners of a tet, once it is flipped."""
+    smp[tet] = not smp[tet]
+    left = 0
+    for vertex in links.vertices[tet]:
+        left += vertex_defects(vertex, nowhere, smp, links, scratch)
+    smp[tet] = not smp[tet]
+    return left
+
+
+@njit(cache=True, nogil=True)
 def anneal(
     smp: BoolArray,
     candidates: Candidates,
     squares: Squares,
-    price: float,
+    prices: tuple,
     room: float,
     temperatures: tuple,
     steps: int,
@@ -93,31 +104,41 @@ def anneal(
 ) -> BoolArray:
     """Which candidates (k,) to flip; `smp` (m,) and `squares` are changed on the way.
 
-    price : of each flip        room : volume that may become SMP        temperatures : first and last
+    prices : of each flip and of each defect        room : volume that may become SMP
+    temperatures : first and last
     """
     nowhere = np.zeros(len(links.n_nodes), np.bool_)
+    defects = all_defects(nowhere, smp, links, scratch)
     flipped = np.zeros(len(candidates.tets), np.bool_)
     best = flipped.copy()
     energy = least = 0.0
-    first, last = temperatures
+    (price, defect_price), (first, last) = prices, temperatures
     temperature = first
     for step in range(steps):
         if step % SAME_TEMPERATURE == 0:
             temperature = first * (last / first) ** (step / steps)
         k = int(random.integers(0, len(flipped)))
-        sign = -1.0 if flipped[k] else 1.0
-        allowed = -temperature * np.log(1.0 - random.random())
+        tet, sign, before = candidates.tets[k], -1.0 if flipped[k] else 1.0, 0
+        for vertex in links.vertices[tet]:
+            before += defects[vertex]
+        # At best the flip removes all defects at its corners.
+        allowed = before * defect_price - temperature * np.log(1.0 - random.random())
         rise = _rise(k, sign, squares) + sign * price
-        tet = candidates.tets[k]
         if rise > allowed or not _at_interface(k, smp, candidates) or (not smp[tet] and candidates.volumes[k] > room):
             continue
         if len(squares.beyond):
             rise += _rise_of_limits(k, sign, squares)
-        if rise > allowed or not harmless_flip(tet, nowhere, smp, links, scratch):
+        if rise > allowed:
+            continue
+        left = _defects_left(tet, nowhere, smp, links, scratch)
+        rise += (left - before) * defect_price
+        if left > before or rise > allowed - before * defect_price:
             continue
         _take(k, sign, squares)
         room += candidates.volumes[k] if smp[tet] else -candidates.volumes[k]
         smp[tet], flipped[k] = not smp[tet], not flipped[k]
+        for vertex in links.vertices[tet]:
+            defects[vertex] = vertex_defects(vertex, nowhere, smp, links, scratch)
         energy += rise
         if energy < least:
             least = energy

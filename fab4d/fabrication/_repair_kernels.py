@@ -115,24 +115,6 @@ def all_defects(pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scrat
     return defects
 
 
-@njit(cache=True)
-def harmless_flip(t: int, pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> bool:
-    """Whether a flip of tet t adds no defect at its vertices."""
-    before = _defects_around(t, pinched, smp, links, scratch)
-    smp[t] = not smp[t]
-    after = _defects_around(t, pinched, smp, links, scratch)
-    smp[t] = not smp[t]
-    return after <= before
-
-
-@_inner
-def _defects_around(t: int, pinched: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
-    total = 0
-    for corner in range(4):
-        total += vertex_defects(links.vertices[t, corner], pinched, smp, links, scratch)
-    return total
-
-
 @_inner
 def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
     """scratch.group: component of each tet of the star (equal labels, joined by faces); of node >= 0 at that edge only.

@@ -1,4 +1,4 @@
-"""Flips of tets that together lower an error most and pinch nothing.
+"""Flips of tets that together lower an error most and pinch nothing, or mend what is pinched.
 
 One flip after the other, each for the better, soon finds none that is allowed: most would pinch the boundary where they
 are, and others are needed first that make the error larger. Simulated annealing takes these too, the more rarely the
@@ -24,10 +24,10 @@ MOST_STEPS = 20_000_000
 
 
 class Energy(Protocol):
-    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + price of flips of tets (k,).
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + prices, of flips of tets (k,).
 
     error (p,), changes (k, p) : of a shape        beyond (l,), limit_changes (k, l) : of limits that it should keep
-    price : of each flip
+    price, defect_price : of each flip, and of each defect of the boundary that is left
     """
 
     @property
@@ -42,6 +42,8 @@ class Energy(Protocol):
     def limit_changes(self) -> FloatArray: ...
     @property
     def price(self) -> float: ...
+    @property
+    def defect_price(self) -> float: ...
 
 
 # Of labels (m,), the energy of flips, the volume that may become SMP, steps for each tet, and a seed.
@@ -59,9 +61,9 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
     def annealed(labels: BoolArray, energy: Energy, room: float, steps: int, seed: int) -> BoolArray:
         candidates = Candidates(energy.tets, neighbours[energy.tets], volumes[energy.tets])
         squares = _squares(energy)
-        start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum())
+        start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum()) or 1.0
         flipped = anneal(
-            labels.copy(), candidates, squares, energy.price, room, (HOT * start, COLD * start),
+            labels.copy(), candidates, squares, (energy.price, energy.defect_price), room, (HOT * start, COLD * start),
             min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed), links, scratch,
         )  # fmt: skip
         result = labels.copy()

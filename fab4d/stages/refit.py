@@ -9,7 +9,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, polish_labels
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, mended, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -105,8 +105,8 @@ def _printed_design(
     """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
 
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
-    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair,
-    if the equilibria agree.
+    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair, or
+    where it costs much, the labels are mended otherwise, if the equilibria agree.
     """
     problem, rho = equilibria.problem, smp.astype(np.float64)
     design = _carried(equilibria, relaxed, rho) if problem.n_tets > MANY_TETS else None
@@ -119,13 +119,33 @@ def _printed_design(
         wanted += [better] if (better != smp).any() else []
     calls = [partial(_followed, equilibria, before, labels, weights) for labels in wanted]
     found = [each for each in side_by_side(calls, 3 * problem.n_nodes) if each is not None]
+
+    def rms_of(printed: _Printed) -> float:
+        return shape_error(problem, printed.fitted.final.y).rms
+
+    if min(map(rms_of, found), default=np.inf) > settings.target_rms:
+        followed = _mended(equilibria, before, weights, settings)
+        found += [] if followed is None else [followed]
     if not found:
         followed = _followed(equilibria, before, smp, weights, patient=True)
         found = [] if followed is None else [followed]
     if not found:
         design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
         return _Printed(design, design)
-    return min(found, key=lambda each: shape_error(problem, each.fitted.final.y).rms)
+    return min(found, key=rms_of)
+
+
+def _mended(
+    equilibria: Equilibria, before: Design, weights: ObjectiveWeights, settings: FlipSettings
+) -> _Printed | None:
+    """Labels of a near 0/1 design that are mended for little error rather than by few changes, and made printable.
+
+    None where nothing is mended or no equilibria lead to them.
+    """
+    design = mended(equilibria, before, weights, settings, FEW_STEPS)
+    if design is before:
+        return None
+    return _followed(equilibria, design, settings.printable(design.rho > 0.5), weights)
 
 
 def _followed(

@@ -15,6 +15,7 @@ from fab4d.design.flips import (
     compensated,
     error_left,
     flip,
+    mended,
     near_interface,
     polish_labels,
 )
@@ -22,8 +23,10 @@ from fab4d.design.gauss_newton import Design, equilibrate, held_positions
 from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
+from fab4d.design.reduced import at_rest, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.annealing import annealer
+from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
 from fab4d.mesh.rigid import best_rigid_motion
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3)
@@ -162,6 +165,46 @@ def test_a_repair_is_made_up_for() -> None:
 
     kept = compensated(problem, found, smp, repair, replace(freely(problem), printable=bad))
     np.testing.assert_array_equal(kept, repair)
+
+
+def test_pinched_labels_are_mended_near_the_wanted_shape() -> None:
+    """Better than by the flips that change the least volume; held positions follow, and so do shapes."""
+    problem = bar(cells=(6, 3, 2), degrees=30.0)
+    tets, volumes = problem.body.elements[:, :4], problem.volume_fractions
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    smp[np.flatnonzero(at_interface(problem, smp))[::3]] ^= True
+    assert len(pinched_vertices(tets, smp))
+    design = held_design(equilibria, smp.astype(float), problem.X_temp)
+    made = mended(equilibria, design, WEIGHTS, freely(problem), 3)
+    assert len(pinched_vertices(tets, made.rho > 0.5)) == 0
+    assert set(np.unique(made.rho)) == {0.0, 1.0}
+    least = well_composed(tets, smp, volumes).astype(float)
+    held = held_positions(equilibria, design.median)
+    other = equilibrate(equilibria, least, held, design.median.x, design.median.forces, design.final.y)
+    assert other is not None
+    fitted = refit(equilibria, other, WEIGHTS, lambda at: None, 3)  # noqa: ARG005
+    assert shape_error(problem, made.final.y).rms < shape_error(problem, fitted.final.y).rms
+
+
+def test_labels_stay_that_cannot_be_mended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No interface, no points, nothing that is mended, or no equilibrium of what is."""
+    problem = bar(degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    smp[np.flatnonzero(at_interface(problem, smp))[::3]] ^= True
+    design = held_design(equilibria, smp.astype(float), problem.X_temp)
+    asked = replace(freely(problem), annealed=lambda labels, *rest: labels)  # noqa: ARG005
+    assert mended(equilibria, design, WEIGHTS, asked, 3) is design
+    plain = held_design(equilibria, np.zeros(problem.n_tets), problem.X_temp)
+    assert mended(equilibria, plain, WEIGHTS, freely(problem), 3) is plain
+    rest = at_rest(problem)
+    assert mended(rest.equilibria, rest.design, WEIGHTS, freely(problem), 3) is rest.design
+
+    def lost(*args: object, **named: object) -> Design:  # noqa: ARG001
+        msg = "none"
+        raise EquilibriumError(msg)
+
+    monkeypatch.setattr(flips, "change_density", lost)
+    assert mended(equilibria, design, WEIGHTS, freely(problem), 3) is design
 
 
 def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 """Annealed labels: the least energy of all that pinch nothing, found again by trying them all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from pinches import pinched_by_hand
 
 from fab4d.fabrication import annealing
+from fab4d.fabrication._repair_kernels import all_defects
 from fab4d.fabrication.annealing import annealer
 from fab4d.fabrication.features import tet_neighbours
-from fab4d.fabrication.wellcomposed import well_composed
+from fab4d.fabrication.wellcomposed import link_tables, well_composed
 from fab4d.mesh.measures import tet_volumes
 
 
@@ -23,6 +24,7 @@ class Energy:
     beyond: np.ndarray
     limit_changes: np.ndarray
     price: float
+    defect_price: float = 0.0
 
     def of(self, before: np.ndarray, labels: np.ndarray) -> float:
         flipped = (labels != before)[self.tets]
@@ -58,6 +60,41 @@ def test_nothing_is_pinched_and_the_energy_falls(meshes, seed, n_points):
     labels = annealer(tets, volumes)(smp, energy, 1.0, 50, seed)
     assert pinched_by_hand(tets, labels) == []
     assert energy.of(smp, labels) <= energy.of(smp, smp)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), n_points=st.integers(5, 40))
+def test_most_of_what_is_pinched_is_mended_where_that_is_worth_much(meshes, seed, n_points):
+    """And less where it is not; never is more pinched than before."""
+    X, tets = meshes["irregular"](n_points, seed)
+    smp, volumes = np.random.default_rng(seed).random(len(tets)) < 0.5, tet_volumes(X, tets)
+    energy, annealed = energy_by_chance(np.arange(len(tets)), seed), annealer(tets, volumes / volumes.sum())
+    dear = annealed(smp, replace(energy, defect_price=10.0), 1.0, 300, seed)
+    left = [len(pinched_by_hand(tets, labels)) for labels in (smp, annealed(smp, energy, 1.0, 300, seed), dear)]
+    assert left[0] >= left[1]
+    assert left[2] <= 0.3 * left[0]
+
+
+def test_a_flip_is_made_that_costs_less_than_the_defects_it_mends_are_worth(meshes):
+    mended = 0
+    for seed in range(30):
+        tets, volumes, smp = case(meshes, seed)
+        tet = np.random.default_rng(seed).integers(0, len(tets), 1)
+        spoilt = smp.copy()
+        spoilt[tet] ^= True
+        links, scratch = link_tables(tets)
+        nowhere = np.zeros(len(links.n_nodes), bool)
+        defects, none = (int(all_defects(nowhere, labels, links, scratch).sum()) for labels in (spoilt, smp))
+        if defects == 0 or tet[0] not in interface(tets, spoilt):
+            continue
+        assert none == 0
+        nothing, cost = np.zeros(0), 0.7**2 + 0.1
+        energy = Energy(tet, np.array([1e-6]), np.array([[0.7]]), nothing, np.zeros((1, 0)), 0.1)
+        for factor, labels in ((0.95, spoilt), (1.05, smp)):
+            worth = replace(energy, defect_price=factor * cost / defects)
+            np.testing.assert_array_equal(annealer(tets, volumes)(spoilt, worth, 1.0, 500, 0), labels)
+        mended += 1
+    assert mended > 3
 
 
 def test_the_least_of_all_allowed_energies_is_found(meshes):
@@ -121,6 +158,12 @@ def test_volume_that_may_become_smp_is_not_exceeded(meshes, room, price):
     labels = annealer(tets, volumes)(smp, wanted, room, 200, 0)
     assert (labels != smp).any()
     assert volumes @ labels <= volumes @ smp + room + 1e-12
+
+
+def test_without_an_error_prices_alone_count(meshes):
+    tets, volumes, smp = case(meshes, 7)
+    energy = replace(energy_by_chance(np.arange(len(tets)), 7), error=np.zeros(5), beyond=np.array([-1.0, -1.0]))
+    np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 0), smp)
 
 
 def test_nothing_is_flipped_that_costs_more_than_it_brings(meshes):

@@ -96,6 +96,7 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
     given = (equilibria, inputs["relaxed"], smp, weights, refit._flip_settings(inputs, PROFILE, problem, weights))
     monkeypatch.setattr(refit, "influence_near", lambda *_: None)
+    monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
     by_path = refit._printed_design(*given).design
 
     def not_taken(*_: Any) -> Design:
@@ -161,6 +162,37 @@ def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     printed = refit._printed_design(equilibria, inputs["relaxed"], spoilt, weights, settings).design
     fits = [refit.refit(equilibria, each, weights, lambda at: None) for each in (as_they_are, printed)]  # noqa: ARG005
     assert rms(problem, fits[1]) <= rms(problem, fits[0])
+
+
+def test_labels_are_mended_otherwise_where_their_repair_costs_much(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And taken where they come nearer; not looked for where the error is small enough."""
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
+    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    settings = replace(settings, printable=lambda smp: smp)
+    enough, never = replace(settings, target_rms=1.0), replace(settings, target_rms=0.0)
+    monkeypatch.setattr(refit, "compensated", lambda problem, flips, before, smp, settings: smp)  # noqa: ARG005
+    labels = [inputs["rounded"]["smp"], inputs["rounded"]["smp"].copy()]
+    labels[1][np.flatnonzero(at_interface(problem, labels[0]))[::2]] ^= True
+    made = [refit._printed_design(equilibria, inputs["relaxed"], smp, weights, enough) for smp in labels]
+    best, worst = np.argsort([rms(problem, each.fitted) for each in made])
+    asked: list[Design] = []
+
+    def mended(at: Equilibria, before: Design, *_: Any) -> Design:  # noqa: ARG001
+        asked.append(before)
+        return made[best].fitted
+
+    monkeypatch.setattr(refit, "mended", mended)
+    for target, taken in ((enough, worst), (never, best)):
+        printed = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, target)
+        np.testing.assert_array_equal(printed.design.rho > 0.5, labels[taken])
+        assert bool(asked) == (target is never)
+    monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
+    same = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, never)
+    np.testing.assert_array_equal(same.design.rho > 0.5, labels[worst])
 
 
 def rms(problem: Problem, design: Design) -> float:
