@@ -117,6 +117,31 @@ def test_flips_become_dearer_where_they_have_no_equilibrium(monkeypatch: pytest.
         assert after.price == pytest.approx(flips.DEARER * before.price)
 
 
+def relative(energy: FlipEnergy) -> float:
+    """The price in squared errors."""
+    return energy.price / float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum())
+
+
+def test_flips_become_cheaper_where_rounds_come_true_or_promise_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = bar(degrees=30.0)
+    equilibria, energies = two_patches(problem), list[FlipEnergy]()
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    settings = replace(recording(freely(problem), energies), rounds=3)
+    values = iter(np.geomspace(1.0, 0.1, 10))
+    monkeypatch.setattr(flips, "evaluate", lambda *_: next(values))
+    monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+    polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
+    assert len(energies) == 3
+    for before, after in itertools.pairwise(energies):
+        assert relative(before) == pytest.approx(flips.CHEAPER * relative(after))
+    energies.clear()
+    stuck = replace(settings, printable=lambda smp: design.rho > 0.5, rounds=15)  # noqa: ARG005
+    polish_labels(equilibria, design, WEIGHTS, stuck, lambda at: None)  # noqa: ARG005
+    assert len(energies) == flips.MOST_POOR
+    for before, after in itertools.pairwise(energies):
+        assert relative(before) == pytest.approx(flips.DEARER * relative(after))
+
+
 def test_a_part_without_smp_is_left_as_it_is() -> None:
     """It comes back to its permanent shape wherever it is held, and has no interface."""
     problem = bar(degrees=30.0)

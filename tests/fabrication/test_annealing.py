@@ -151,13 +151,25 @@ def test_a_seed_gives_the_same_labels_again(meshes):
     assert (first != other).any()
 
 
-@pytest.mark.parametrize(("room", "price"), [(0.0, 0.0), (0.0, 0.01), (0.01, 0.0), (0.01, 0.01)])
-def test_volume_that_may_become_smp_is_not_exceeded(meshes, room, price):
+@pytest.mark.parametrize("room", [0.0, 0.02, 1.0])
+def test_volume_that_may_become_smp_is_not_exceeded(meshes, room):
+    """Where all SMP that there is would lower the error."""
     tets, volumes, smp = case(meshes, 7)
-    wanted = energy_by_chance(np.arange(len(tets)), 7, price=price)
-    labels = annealer(tets, volumes)(smp, wanted, room, 200, 0)
-    assert (labels != smp).any()
-    assert volumes @ labels <= volumes @ smp + room + 1e-12
+    nothing, changes = np.zeros(0), np.where(smp, 1e-3, -1e-3)[:, None]
+    wanted = Energy(np.arange(len(tets)), np.ones(1), changes, nothing, np.zeros((len(tets), 0)), 0.0)
+    labels = annealer(tets, volumes)(smp, wanted, room, 500, 0)
+    grown = volumes @ labels - volumes @ smp
+    assert grown <= room + 1e-12
+    assert grown >= min(0.9 * room, 0.1) - 0.01
+
+
+def test_limits_count_until_they_are_kept(meshes):
+    """Some twenty flips bring a limit down to what it should be, and more gain nothing."""
+    tets, volumes, smp = case(meshes, 7)
+    lowers = np.full((len(tets), 1), -0.05)
+    energy = Energy(np.arange(len(tets)), np.zeros(1), np.zeros((len(tets), 1)), np.ones(1), lowers, 1e-6)
+    labels = annealer(tets, volumes)(smp, energy, 1.0, 500, 0)
+    assert 18 <= (labels != smp).sum() <= 22
 
 
 def test_without_an_error_prices_alone_count(meshes):
