@@ -15,8 +15,10 @@ def nodes_around(tet, elements, edges, star_start, star, local):
     edges (6, 2) : corners between which the fifth to tenth node of an element are
     star_start (n + 1,), star : tets of each vertex in turn        local (N,) : -1; returned so
     """
-    own = elements[tet]
-    found, count = np.zeros(len(local), np.int64), 0
+    own, most, count = elements[tet], 0, 0
+    for vertex in own[:4]:
+        most += (star_start[vertex + 1] - star_start[vertex]) * len(own)
+    found = np.zeros(most, np.int64)
     for node in own:
         local[node] = 0
     for vertex in own[:4]:

@@ -20,7 +20,7 @@ from fab4d.elasticity import _kernels as kernels
 from fab4d.elasticity.pattern import DirichletMask, SymmetricPattern
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import FloatArray, IntArray
-from fab4d.mesh.topology import TET_EDGES
+from fab4d.mesh.topology import TET_EDGES, cells_by_vertex
 from fab4d.solvers.threads import side_by_side
 
 # Dense systems are made for so many tets at once.
@@ -45,17 +45,19 @@ def flip_loads(equilibria: Equilibria, design: Design, lin: Linearisation, tets:
     x, y = design.median.x, design.final.y
     hot = _Tangent(equilibria.held_pattern, equilibria.median_tangent(rho, x), equilibria.held_mask)
     cold = _Tangent(equilibria.free_pattern, equilibria.final_tangent(rho, design.median, y), equilibria.free_mask(y))
-    stars = _Stars.of(problem.body.elements)
+    corners = problem.body.elements[:, :4]
+    at_vertex = cells_by_vertex(corners, int(corners.max()) + 1)
 
     n_loads = 3 * problem.body.elements.shape[1]
     of_hot, of_cold = np.zeros((len(tets), n_loads)), np.zeros((len(tets), n_loads))
 
     def fill(part: slice) -> None:
         some = tets[part]
-        around_hot, around_cold = (_around(stars, tangent, some) for tangent in (hot, cold))
+        around_hot, around_cold = (_around(problem.body.elements, at_vertex, tangent, some) for tangent in (hot, cold))
         of_hot[part] = f_hot = hot_forces(equilibria, design, some, _compliances(around_hot))
         moved = [each.moves(-f) for each, f in zip(around_hot, f_hot, strict=True)]
-        followed = np.array([-each.follow(lin.M, dx) for each, dx in zip(around_cold, moved, strict=True)])
+        local = np.full(problem.n_nodes, -1)
+        followed = np.array([-each.follow(lin.M, dx, local) for each, dx in zip(around_cold, moved, strict=True)])
         own = np.array([dx[-n_loads:] for dx in moved])
         of_cold[part] = cold_forces(equilibria, design, some, own, followed, _compliances(around_cold))
 
@@ -152,22 +154,6 @@ class _Tangent:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stars:
-    """Elements (m, nn), where the tets of each vertex begin (n + 1,), and the tets of each in turn."""
-
-    elements: IntArray
-    start: IntArray
-    tets: IntArray
-
-    @staticmethod
-    def of(elements: IntArray) -> "_Stars":
-        corners = elements[:, :4].ravel()
-        order = np.argsort(corners, kind="stable")
-        start = np.searchsorted(corners[order], np.arange(corners.max() + 2))
-        return _Stars(elements, start.astype(np.int64), order // 4)
-
-
-@dataclass(frozen=True, eq=False)
 class _Around:
     """Nodes around a tet, its own ones last, and how they move while all others stay.
 
@@ -186,22 +172,24 @@ class _Around:
         forces[-len(f) :] = self.free * f
         return self.solve(forces)
 
-    def follow(self, M: bsr_array, moved: FloatArray) -> FloatArray:
-        """(3nn,) K^-1 M moved, of the tet's own nodes."""
+    def follow(self, M: bsr_array, moved: FloatArray, local: IntArray) -> FloatArray:
+        """(3nn,) K^-1 M moved, of the tet's own nodes. local (N,) : as in the kernels"""
         forces = np.zeros_like(moved)
-        local = np.full(M.shape[0] // 3, -1)
         star_kernels.product(self.nodes, M.indptr, M.indices, M.data, local, moved, forces)
         return self.free * self.solve(forces)[-len(self.free) :]
 
 
-def _around(stars: _Stars, tangent: _Tangent, tets: IntArray) -> list[_Around]:
+def _around(
+    elements: IntArray, at_vertex: tuple[IntArray, IntArray], tangent: _Tangent, tets: IntArray
+) -> list[_Around]:
+    """at_vertex : of the tets, by `cells_by_vertex`"""
     pattern, found = tangent.pattern, list[_Around]()
     local, free = np.full(pattern.n_nodes, -1), np.ones(pattern.n_dofs)
     free[tangent.mask.fixed] = 0.0
     for tet in tets:
-        nodes = star_kernels.nodes_around(tet, stars.elements, TET_EDGES, stars.start, stars.tets, local)
+        nodes = star_kernels.nodes_around(tet, elements, TET_EDGES, *at_vertex, local)
         K = star_kernels.between(nodes, pattern.indptr, pattern.indices, tangent.data, local)
-        own = free[element_dofs(stars.elements[tet][None])[0]]
+        own = free[element_dofs(elements[tet][None])[0]]
         found.append(_factored(nodes, K, own))
     return found
 

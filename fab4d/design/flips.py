@@ -110,7 +110,7 @@ def mended(
 ) -> Design:
     """The 0/1 design with places where its boundary is pinched mended by the flips that together cost least.
 
-    steps : of the held positions after it
+    Flips that only lower the error are made with them. steps : of the held positions after it
     It is left as it is where nothing can be mended, and where the labels have no stable equilibrium near.
     """
     problem, smp = equilibria.problem, design.rho > 0.5
@@ -118,8 +118,8 @@ def mended(
     if not equilibria.patches.count or not tets.size:
         return design
     found = influence(equilibria, design, tets, weights)
-    energy = found.energy(np.zeros(len(tets), bool), SURE_PRICE / fineness(problem), DEFECT_PRICE)
-    labels = settings.annealed(smp, energy, _room(problem, smp, settings), STEPS, 0)
+    price = SURE_PRICE / fineness(problem)
+    labels = flip(problem, found, smp, smp, settings, price, STEPS, defect_price=DEFECT_PRICE)
     changed = _changed(equilibria, design, labels) if (labels != smp).any() else None
     return design if changed is None else refit(equilibria, changed, weights, lambda at: None, steps)  # noqa: ARG005
 
@@ -163,19 +163,16 @@ def flip(
     price: float,
     steps: int,
     seed: int = 0,
+    defect_price: float = 0.0,
 ) -> BoolArray:
     """Labels (m,) near `labels` (m,) that pinch no more and have a lower predicted error.
 
-    before : (m,) labels that `found` is about        price : of a flip, in squared errors of `labels`
-    steps, seed : of the annealing, for each candidate
+    before : (m,) labels that `found` is about        steps, seed : of the annealing, for each candidate
+    price, defect_price : of a flip, and of a place that stays pinched, in squared errors of `labels`
     """
-    energy = found.energy((labels != before)[found.tets], price)
-    return settings.annealed(labels, energy, _room(problem, labels, settings), steps, seed)
-
-
-def _room(problem: Problem, labels: BoolArray, settings: FlipSettings) -> float:
-    """Share of the volume that may become SMP."""
-    return settings.max_smp_fraction - float(problem.volume_fractions @ labels)
+    energy = found.energy((labels != before)[found.tets], price, defect_price)
+    room = settings.max_smp_fraction - float(problem.volume_fractions @ labels)
+    return settings.annealed(labels, energy, room, steps, seed)
 
 
 def near_interface(problem: Problem, labels: BoolArray) -> BoolArray:

@@ -117,15 +117,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """A predicted design with the held positions where they lower the objective most.
+    """Moves (3K,) of the held positions that lower the objective of a predicted design most, and what is left.
 
-    squared : its error in L0, squared, and that of the limits that it is beyond
-    beyond (l,) : of each limit        active (l,) : whether it holds back        moves (3K,) : of the held positions
+    squared : the error in L0, squared, and that of the limits that it is beyond
     """
 
     squared: float
-    beyond: FloatArray
-    active: BoolArray
     moves: FloatArray
 
 
@@ -196,7 +193,7 @@ class Influence:
                 break
         settled = beyond + moves @ view.limits_by_held
         squared += float(2 * toward @ moves + moves @ view.gram @ moves + (np.maximum(settled, 0) ** 2).sum())
-        return Settled(max(squared, 0.0), settled, settled > 0, moves)
+        return Settled(max(squared, 0.0), moves)
 
     def energy(self, flipped: BoolArray, price: float, defect_price: float = 0.0) -> "FlipEnergy":
         """What flips cost where the tets `flipped` (k,) are flipped already. Prices are in squared errors then.

@@ -224,27 +224,6 @@ def element_tangents(elements, dN, weights, mu, kappa, u, blocks):
 
 
 @njit(cache=True, nogil=True)
-def gather_blocks(elements, rank, indptr, data, blocks):
-    """Copies what a matrix that `tangent` assembled has between the nodes of each element: (m, nn, nn, 3, 3)."""
-    nn = elements.shape[1]
-    for m in range(elements.shape[0]):
-        pair = 0
-        for a0 in range(nn):
-            for b0 in range(a0 + 1):
-                a, b = a0, b0
-                if elements[m, a] < elements[m, b]:
-                    a, b = b0, a0
-                r = rank[m, pair]
-                for k in range(3):
-                    column = 3 * elements[m, b] + k
-                    for i in range(k if r < 0 else 0, 3):
-                        value = data[indptr[column] + (i - k if r < 0 else 3 - k + 3 * r + i)]
-                        blocks[m, a, b, i, k] = value
-                        blocks[m, b, a, k, i] = value
-                pair += 1
-
-
-@njit(cache=True, nogil=True)
 def _eigen_symmetric(A, V):
     """Cyclic Jacobi: eigenvectors of A (3, 3) as columns of V; A is overwritten, eigenvalues on its diagonal."""
     for i in range(3):

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fab4d.mesh._coarsening_kernels import Limits, Stars, collapse
 from fab4d.mesh.measures import edge_matrices
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
-from fab4d.mesh.topology import face_table, unique_edges
+from fab4d.mesh.topology import cells_by_vertex, face_table, unique_edges
 
 # In units of the mean edge that the wanted number of tets would have.
 LONGEST_EDGE, LARGEST_DISTANCE = 2.0, 0.07
@@ -60,13 +60,7 @@ def coarsened(X: FloatArray, x: FloatArray, tets: IntArray, clamp: BoolArray, n_
 
 def _stars(tets: IntArray, n: int) -> Stars:
     faces = np.ascontiguousarray(face_table(tets).boundary)
-    return Stars(tets, *_by_vertex(tets, n), faces, *_by_vertex(faces, n))
-
-
-def _by_vertex(cells: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    order = np.argsort(cells.ravel(), kind="stable")
-    first = np.searchsorted(cells.ravel()[order], np.arange(n + 1))
-    return first, order // cells.shape[1]
+    return Stars(tets, *cells_by_vertex(tets, n), faces, *cells_by_vertex(faces, n))
 
 
 def nearest_tets(X: FloatArray, tets: IntArray, points: FloatArray) -> IntArray:

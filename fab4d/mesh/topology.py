@@ -59,6 +59,13 @@ def unique_edges(tets: IntArray) -> tuple[IntArray, IntArray]:
     return edges, inverse.reshape(-1, 6)
 
 
+def cells_by_vertex(cells: IntArray, n_vertices: int) -> tuple[IntArray, IntArray]:
+    """Where the cells (m, k) of each vertex begin (n + 1,), and the cells of each vertex in turn (m k,)."""
+    corners = cells.ravel()
+    order = np.argsort(corners, kind="stable")
+    return np.searchsorted(corners[order], np.arange(n_vertices + 1)), order // cells.shape[1]
+
+
 def component_labels(n_items: int, pairs: IntArray) -> IntArray:
     """Connected-component number (n_items,) of the graph with edges `pairs` (k, 2)."""
     graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n_items, n_items))

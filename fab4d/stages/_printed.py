@@ -42,10 +42,10 @@ def as_printed(
     found: Search,
     good_enough: float = 0.0,
 ) -> Printed:
-    """The design as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
+    """The design about as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
 
-    The best of few repairs, for this judges many designs. Flips take long: they are left out up to the RMS error
-    `good_enough`, L0, and where they cannot reach the tolerance.
+    The best of few repairs and none by annealing, for this judges many designs. Flips take long: they are left out up
+    to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
     """
     settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
     smp = repaired(mesh, printer, settings, found, weights, more=0).smp

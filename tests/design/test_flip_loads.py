@@ -11,7 +11,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flip_loads import flip_loads
 from fab4d.design.gauss_newton import Design
 from fab4d.design.sensitivity import linearise
-from fab4d.mesh.topology import TET_EDGES
+from fab4d.mesh.topology import TET_EDGES, cells_by_vertex
 
 
 @pytest.fixture(scope="module", params=["linear", "quadratic"])
@@ -21,11 +21,14 @@ def state(request: pytest.FixtureRequest) -> tuple[Equilibria, Design]:
     return equilibria, held_design(equilibria, np.round(mixed_density(problem)), problem.X_temp)
 
 
+def at_vertex(elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return cells_by_vertex(elements[:, :4], int(elements[:, :4].max()) + 1)
+
+
 def around(equilibria: Equilibria, tet: int) -> np.ndarray:
     elements = equilibria.problem.body.elements
-    stars = module._Stars.of(elements)
     local = np.full(equilibria.problem.n_nodes, -1)
-    nodes = kernels.nodes_around(tet, elements, TET_EDGES, stars.start, stars.tets, local)
+    nodes = kernels.nodes_around(tet, elements, TET_EDGES, *at_vertex(elements), local)
     assert (local == -1).all()
     return nodes
 
@@ -89,7 +92,9 @@ def test_tets_among_nodes_that_give_way_move_as_the_small_system_says(
     for factored in (True, False):
         if not factored:
             monkeypatch.setattr(kernels, "cholesky", lambda L: False)  # noqa: ARG005
-        for tet, found in zip(tets, module._around(module._Stars.of(elements), tangent, np.array(tets)), strict=True):
+        for tet, found in zip(
+            tets, module._around(elements, at_vertex(elements), tangent, np.array(tets)), strict=True
+        ):
             at, size = dofs(found.nodes), 3 * elements.shape[1]
             inverse = np.linalg.inv(K[np.ix_(at, at)])
             free = ~np.isin(dofs(elements[tet]), mask.fixed)
@@ -100,7 +105,11 @@ def test_tets_among_nodes_that_give_way_move_as_the_small_system_says(
             np.testing.assert_allclose(found.moves(f), inverse[:, -size:] @ (free * f), atol=1e-8 * scale)
             moved = np.random.default_rng(1).normal(size=len(at))
             followed = free * (inverse @ (M.toarray()[np.ix_(at, at)] @ moved))[-size:]
-            np.testing.assert_allclose(found.follow(M, moved), followed, atol=1e-7 * np.abs(followed).max())
+            np.testing.assert_allclose(
+                found.follow(M, moved, np.full(equilibria.problem.n_nodes, -1)),
+                followed,
+                atol=1e-7 * np.abs(followed).max(),
+            )
 
 
 def test_a_matrix_that_is_not_positive_definite_has_no_factor() -> None:

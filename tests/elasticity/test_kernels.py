@@ -60,16 +60,6 @@ def test_tangents_of_the_elements_add_up_to_the_tangent(solid, u):
     np.testing.assert_allclose(change, expected, atol=1e-12 * np.abs(expected).max())
 
 
-def test_blocks_between_nodes_are_those_of_the_whole_tangent(solid, u):
-    elements = solid.body.elements
-    nn, whole = elements.shape[1], solid.stiffness(u).toarray()
-    blocks = np.zeros((len(elements), nn, nn, 3, 3))
-    kernels.gather_blocks(elements, solid.pattern.rank, solid.pattern.indptr, solid.tangent_data(u), blocks)
-    dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), -1)
-    found = blocks.transpose(0, 1, 3, 2, 4).reshape(len(elements), 3 * nn, 3 * nn)
-    np.testing.assert_array_equal(found, whole[dofs[:, :, None], dofs[:, None, :]])
-
-
 def test_mixed_block_is_the_derivative_with_respect_to_the_median_shape(solid, u, bodies):
     """Forces of the glassy term at fixed y, differentiated with respect to the shape x that it is stress-free in."""
     rng = np.random.default_rng(5)
