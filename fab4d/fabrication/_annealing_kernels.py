@@ -1,6 +1,6 @@
 """Compiled simulated annealing of labels. `annealing.py` explains it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -9,6 +9,10 @@ from fab4d.fabrication._links import Links
 from fab4d.fabrication._repair_kernels import Scratch, all_defects, vertex_defects
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
+# Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile.
+_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_inner = njit(cache=True, nogil=True, **_NO_ENTRY)
+_sums = njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, **_NO_ENTRY)
 # Steps at one temperature.
 SAME_TEMPERATURE = 256
 
@@ -36,7 +40,7 @@ class Squares(NamedTuple):
     limit_changes: FloatArray
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@_sums
 def _rise(k: int, sign: float, squares: Squares) -> float:
     """By how much the squares of the error grow with a flip, or with one taken back (sign -1)."""
     if squares.gram.size:
@@ -48,7 +52,7 @@ def _rise(k: int, sign: float, squares: Squares) -> float:
     return 2 * sign * slope + own
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@_sums
 def _rise_of_limits(k: int, sign: float, squares: Squares) -> float:
     rise = 0.0
     for i in range(len(squares.beyond)):
@@ -58,7 +62,7 @@ def _rise_of_limits(k: int, sign: float, squares: Squares) -> float:
     return rise
 
 
-@njit(cache=True, nogil=True)
+@_inner
 def _take(k: int, sign: float, squares: Squares) -> None:
     if squares.gram.size:
         for j in range(len(squares.slope)):
@@ -70,7 +74,7 @@ def _take(k: int, sign: float, squares: Squares) -> None:
         squares.beyond[i] += sign * squares.limit_changes[k, i]
 
 
-@njit(cache=True, nogil=True)
+@_inner
 def _at_interface(k: int, smp: BoolArray, candidates: Candidates) -> bool:
     found = False
     for other in candidates.neighbours[k]:
@@ -78,7 +82,7 @@ def _at_interface(k: int, smp: BoolArray, candidates: Candidates) -> bool:
     return found
 
 
-@njit(cache=True, nogil=True)
+@_inner
 def _defects_left(tet: int, nowhere: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
     """At the corners of a tet, once it is flipped."""
     smp[tet] = not smp[tet]
