@@ -52,22 +52,23 @@ def carried_over(
     return equilibrate(equilibria, rho, held, median.x, median.forces, y, max_iterations=100)
 
 
-def rounded_in(problem: Problem, relaxed: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
-    """A near 0/1 design in the elements of `problem` from a relaxed one, about to be rounded, in other elements.
+def carried_in(problem: Problem, relaxed: Search) -> Search | None:
+    """A relaxed design, about to be rounded, in the elements of `problem`, which are others of the same mesh.
 
-    watch : is shown the phase and the state after each step
-    None where the elements find no equilibrium near it, or none on the way to 0 and 1.
+    None where these find no equilibrium near it.
     """
     before, design = relaxed.equilibria.patches, relaxed.design
     equilibria = Equilibria(problem, patches_from_faces(problem, before.centers, before.faces, before.offsets))
     start = carried_over(equilibria, design.rho, design.median.x, design.final.y, design.median.forces)
-    if start is None:
-        return None
-    return rounded_from(replace(relaxed, equilibria=equilibria, design=start), settings, watch)
+    return None if start is None else replace(relaxed, equilibria=equilibria, design=start)
 
 
 def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
-    """A near 0/1 design from a relaxed one that was carried over from another discretisation: as `rounded_in`."""
+    """A near 0/1 design from a relaxed one that was carried over from another discretisation.
+
+    watch : is shown the phase and the state after each step
+    None where no equilibria lead to 0 and 1.
+    """
     problem = carried.equilibria.problem
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)

@@ -1,8 +1,7 @@
 """Stage `refit`: the held positions that are best for the labels that will be printed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from fab4d.fabrication.labels import smp_clusters
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
-from fab4d.solvers.threads import side_by_side
 from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
@@ -39,6 +37,8 @@ ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
 # So they do where the relaxed design is out of reach of the tolerance.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
+# Some rounds of flips bring a design from up to this multiple of the error at which they end there.
+WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
 # Share of the way to labels that are hard to come to that a step may come down to.
@@ -105,27 +105,23 @@ def _printed_design(
     """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
 
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
-    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair, or
-    where it costs much, the labels are mended otherwise, if the equilibria agree.
+    short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair; as
+    long as the design is beyond the reach of some rounds of flips, the repair alone is tried, and another way to mend
+    the labels.
     """
     problem, rho = equilibria.problem, smp.astype(np.float64)
     design = _carried(equilibria, relaxed, rho) if problem.n_tets > MANY_TETS else None
     if design is not None:
         return _Printed(design, design)
-    before, wanted = _relaxed_design(equilibria, relaxed), [smp]
-    flips = influence_near(equilibria, before, smp, weights)
-    if flips is not None:
-        better = compensated(problem, flips, before.rho > 0.5, smp, settings)
-        wanted += [better] if (better != smp).any() else []
-    calls = [partial(_followed, equilibria, before, labels, weights) for labels in wanted]
-    found = [each for each in side_by_side(calls, 3 * problem.n_nodes) if each is not None]
+    before, found = _relaxed_design(equilibria, relaxed), list[_Printed]()
 
     def rms_of(printed: _Printed) -> float:
         return shape_error(problem, printed.fitted.final.y).rms
 
-    if min(map(rms_of, found), default=np.inf) > settings.target_rms:
-        followed = _mended(equilibria, before, weights, settings)
+    for followed in _ways(equilibria, before, smp, weights, settings):
         found += [] if followed is None else [followed]
+        if min(map(rms_of, found), default=np.inf) <= WITHIN_REACH * settings.target_rms:
+            break
     if not found:
         followed = _followed(equilibria, before, smp, weights, patient=True)
         found = [] if followed is None else [followed]
@@ -133,6 +129,22 @@ def _printed_design(
         design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
         return _Printed(design, design)
     return min(found, key=rms_of)
+
+
+def _ways(
+    equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights, settings: FlipSettings
+) -> Iterator[_Printed | None]:
+    """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
+
+    smp : (m,) its repair
+    """
+    flips = influence_near(equilibria, before, smp, weights)
+    if flips is not None:
+        better = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
+        if (better != smp).any():
+            yield _followed(equilibria, before, better, weights)
+    yield _followed(equilibria, before, smp, weights)
+    yield _mended(equilibria, before, weights, settings)
 
 
 def _mended(

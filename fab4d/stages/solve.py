@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import rounded_in
+from fab4d.design.finish import carried_in, rounded_from
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
@@ -38,6 +38,13 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 # tolerance: repairs of its labels cost less than the rest.
 CERTAINLY_ENOUGH = 0.5
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
+# Linear elements round a design as well as quadratic ones, and much faster, where its error in quadratic ones is at
+# most this multiple of that in linear ones, held positions unchanged.
+LINEAR_HOLDS = 1.3
+LINEAR_ROUNDS = {
+    "what": "rounding in quadratic elements",
+    "why": "the relaxed design is near to that in linear ones",
+}
 NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
 # Where MANY_TETS are searched, for no coarser mesh does, they are rounded in about half the steps, none of which leads
 # past unstable states: that takes many times longer.
@@ -98,7 +105,12 @@ def _designed(
         least = least_smp(problem, mesh, sections, searched.settings, searched.found, trace, monitor)
         finished = _finished(mesh, profile, element, least.relaxed, searched.settings, trace)
         searched = replace(
-            searched, found=least.found, relaxed=least.relaxed, printed_rms=least.printed_rms, finished=finished
+            searched,
+            found=least.found,
+            relaxed=least.relaxed,
+            printed_rms=least.printed_rms,
+            finished=finished.found,
+            left_out=[*finished.left_out],
         )
     rms = searched.printed_rms
     report = {
@@ -181,6 +193,14 @@ class _Searched:
     more_points: _MorePoints | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class _Finish:
+    """The relaxed design rounded in the elements of the last fit, None where it is not, and what was left out."""
+
+    found: Search | None = None
+    left_out: tuple[dict[str, str], ...] = ()
+
+
 def _finished(
     mesh: Mapping[str, np.ndarray],
     profile: Mapping[str, Any],
@@ -188,17 +208,24 @@ def _finished(
     relaxed: Search,
     settings: ReducedSettings,
     trace: Trace,
-) -> Search | None:
+) -> _Finish:
     """The relaxed design rounded in the elements of the last fit.
 
-    None where these are linear, lose it on the way or need more SMP than the goal allows, and where it misses the
-    tolerance by far.
+    Not where these are linear, lose it on the way or need more SMP than the goal allows, where it misses the tolerance
+    by far, and where linear elements do as well.
     """
-    if element == "linear" or relaxed.phase is not Phase.ROUND or far_off(relaxed, settings):
-        return None
-    problem = problem_of(mesh, profile["materials"], element)
-    finished = rounded_in(problem, relaxed, settings, trace.add)
-    return finished if affordable(finished, profile["goal"]) else None
+    if element == "linear" or relaxed.phase is not Phase.ROUND:
+        return _Finish()
+    if far_off(relaxed, settings):
+        return _Finish(left_out=(NOT_QUADRATIC,))
+    carried = carried_in(problem_of(mesh, profile["materials"], element), relaxed)
+    if carried is None:
+        return _Finish()
+    if _rms(carried) <= LINEAR_HOLDS * relaxed.relaxed_rms:
+        trace.add("carried over", carried)
+        return _Finish(left_out=(LINEAR_ROUNDS,))
+    finished = rounded_from(carried, settings, trace.add)
+    return _Finish(finished if affordable(finished, profile["goal"]) else None)
 
 
 def _picked(
@@ -240,7 +267,7 @@ def _search(
     first, start = _resumed(problem, trace, monitor)
     best, least = _restored_best(problem, monitor)
     before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
-    count, finishes = _points(problem, profile, trace, monitor), dict[int, Search | None]()
+    count, finishes = _points(problem, profile, trace, monitor), dict[int, _Finish]()
     enough = profile["goal"].smp == "enough"
 
     def settings_of(other: Problem) -> ReducedSettings:
@@ -255,7 +282,8 @@ def _search(
         if attempt == 0 and _asked(profile, settings):
             at = starts.best(at, _watch(attempt, None, trace, monitor, before_rounding))
         if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
-            finishes[attempt] = finished = _finished(mesh, profile, element, at, settings, trace)
+            finishes[attempt] = _finished(mesh, profile, element, at, settings, trace)
+            finished = finishes[attempt].found
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
                 return _Searched(at, at, settings, 1, np.inf, finished, [NOT_LINEAR])
         if attempt == 0 and _asked(profile, settings) and far_off(at, settings):
@@ -276,8 +304,8 @@ def _search(
     last = before_rounding[-1]
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
-    left_out = [NOT_QUADRATIC] if element == "quadratic" and far_off(last, settings) else []
-    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt), left_out, more_points)
+    finish = finishes.get(attempt, _Finish())
+    return _Searched(best, last, settings, attempt + 1, least, finish.found, [*finish.left_out], more_points)
 
 
 def _rms(found: Search) -> float:

@@ -5,7 +5,7 @@ import pytest
 from bars import bar
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.finish import LAST_SHARE, carried_over, rounded_in
+from fab4d.design.finish import LAST_SHARE, carried_in, carried_over, rounded_from
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -73,7 +73,9 @@ def moved_rigidly(onto: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def test_a_design_is_rounded_in_the_other_elements(found: Search, quadratic: Problem) -> None:
     shown: list[tuple[str, Search]] = []
-    at = rounded_in(quadratic, found, settings_for(quadratic), lambda phase, at: shown.append((phase, at)))
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    at = rounded_from(carried, settings_for(quadratic), lambda phase, at: shown.append((phase, at)))
     assert at is not None
     assert at.phase is Phase.DONE
     assert len(at.design.median.x) == quadratic.n_nodes

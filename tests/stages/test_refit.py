@@ -20,7 +20,7 @@ from fab4d.design.reduced import change_density
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
-from fab4d.mesh.tetmesh import FloatArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages import refit, solve, threshold
 from fab4d.stages._design import objective_weights, patches_of, problem_of
 from fab4d.stages._element import problem_like
@@ -193,6 +193,35 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
     monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
     same = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, never)
     np.testing.assert_array_equal(same.design.rho > 0.5, labels[worst])
+
+
+def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
+    smp = inputs["rounded"]["smp"]
+    other = smp.copy()
+    other[np.flatnonzero(at_interface(problem, smp))[0]] ^= True
+    before = refit._relaxed_design(equilibria, inputs["relaxed"])
+    design = change_density(equilibria, before, other.astype(np.float64))
+    tried: list[BoolArray | None] = []
+
+    def followed(_at: Equilibria, _before: Design, labels: BoolArray, *_: Any) -> refit._Printed:
+        tried.append(labels)
+        return refit._Printed(design, design)
+
+    monkeypatch.setattr(refit, "compensated", lambda *_: other)
+    monkeypatch.setattr(refit, "_followed", followed)
+    monkeypatch.setattr(refit, "_mended", lambda *_: tried.append(None))
+    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    for share, ways in ((1.001, [other]), (0.999, [other, smp, None])):
+        tried.clear()
+        target = share * rms(problem, design) / refit.WITHIN_REACH
+        refit._printed_design(equilibria, inputs["relaxed"], smp, weights, replace(settings, target_rms=target))
+        assert len(tried) == len(ways)
+        assert all(np.array_equal(got, way) for got, way in zip(tried, ways, strict=True))
 
 
 def rms(problem: Problem, design: Design) -> float:

@@ -10,7 +10,6 @@ from bent_bar import PROFILE, bent_bar
 from shapes.boxes import box
 
 from fab4d.design.objective import shape_error
-from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, at_rest
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
@@ -135,11 +134,13 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
 ) -> None:
     """Where quadratic tets need more SMP than the goal allows, the labels of the linear ones are handed on."""
 
-    def all_smp(problem: Problem, relaxed: Search, *_: Any) -> Search:
+    def all_smp(carried: Search, *_: Any) -> Search:
+        problem = carried.equilibria.problem
         rest = at_rest(problem)
-        return replace(rest, design=replace(rest.design, rho=np.ones(problem.n_tets)), relaxed_rms=relaxed.relaxed_rms)
+        return replace(rest, design=replace(rest.design, rho=np.ones(problem.n_tets)), relaxed_rms=carried.relaxed_rms)
 
-    monkeypatch.setattr(solve, "rounded_in", all_smp)
+    monkeypatch.setattr(solve, "rounded_from", all_smp)
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     for most, kept in ((None, True), (0.9, False)):
         found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=QUADRATIC)["relaxed"]
         assert (len(found["x"]) > len(bar["X"])) == kept
@@ -162,12 +163,24 @@ def test_linear_elements_round_what_quadratic_ones_lose(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = []
-    monkeypatch.setattr(solve, "rounded_in", lambda *_: tried.append(1))
+    monkeypatch.setattr(solve, "rounded_from", lambda *_: tried.append(1))
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
     assert len(tried) == 1
     assert len(found["relaxed"]["x"]) == len(bar["X"])
     assert solve.NOT_LINEAR not in found["solve_report"]["left_out"]
     assert found["solve_report"]["printed_rms_mm"] <= 1.5
+
+
+def test_quadratic_elements_do_not_round_what_they_see_as_linear_ones_do(
+    bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 100.0)
+    found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
+    assert solve.LINEAR_ROUNDS in found["solve_report"]["left_out"]
+    assert phases(found).count(b"carried over") == 1
+    assert phases(found)[phases(found).index(b"carried over") + 1] == b"round"
+    assert len(found["relaxed"]["x"]) == len(bar["X"])
 
 
 def test_a_goal_far_out_of_reach_is_not_rounded_in_quadratic_elements(bar: dict[str, np.ndarray]) -> None:
