@@ -35,7 +35,7 @@ STEPS, FEW_STEPS = 2000, 300
 # Of more tets than this, in proportion more are candidates, each for a smaller gain.
 USUAL_TETS = 5_000
 # So many rounds in a row that gain less end it.
-MOST_POOR = 4
+MOST_POOR = 3
 # Flips whose equilibria are farther away than steps of this share of the change go are given up.
 SMALLEST_STEP = 0.25
 # Steps of the held positions after each round; once all are made, they are fitted to the end.
