@@ -103,14 +103,9 @@ def _designed(
     if profile["goal"].smp == "least":
         sections = {name: profile[name] for name in ("printer", "rig", "goal", "acceptance")}
         least = least_smp(problem, mesh, sections, searched.settings, searched.found, trace, monitor)
-        finished = _finished(mesh, profile, element, least.relaxed, searched.settings, trace)
+        finish = _finished(mesh, profile, element, least.relaxed, searched.settings, trace)
         searched = replace(
-            searched,
-            found=least.found,
-            relaxed=least.relaxed,
-            printed_rms=least.printed_rms,
-            finished=finished.found,
-            left_out=[*finished.left_out],
+            searched, found=least.found, relaxed=least.relaxed, printed_rms=least.printed_rms, finish=finish
         )
     rms = searched.printed_rms
     report = {
@@ -118,9 +113,9 @@ def _designed(
         "printed_rms_mm": rms * problem.length if np.isfinite(rms) else None,
         "least_smp": None if least is None else least.trials,
         "limited_by": _limited_by(problem, profile, searched.found, searched.more_points),
-        "left_out": LEFT_OUT + searched.left_out,
+        "left_out": [*LEFT_OUT, *searched.finish.left_out],
     }
-    return searched.finished or searched.found, searched.relaxed, report
+    return searched.finish.found or searched.found, searched.relaxed, report
 
 
 def _designed_coarse(
@@ -173,13 +168,21 @@ class _MorePoints:
 
 
 @dataclass(frozen=True, eq=False)
+class _Finish:
+    """The relaxed design rounded in the elements of the last fit, None where it is not, and what was left out."""
+
+    found: Search | None = None
+    left_out: tuple[dict[str, str], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class _Searched:
     """What the attempts came to.
 
     found : the best design, rounded in linear elements, or else still relaxed        settings : of the last attempt
     relaxed : the last design before rounding
     printed_rms : RMS error of `found` as printed, L0, inf where it was not judged
-    finished : the last relaxed design, rounded in the elements of the last fit
+    finish : of the last relaxed design
     more_points : what more points would reach, where these are far from the tolerance
     """
 
@@ -188,17 +191,8 @@ class _Searched:
     settings: ReducedSettings
     attempts: int
     printed_rms: float
-    finished: Search | None
-    left_out: list[dict[str, str]]
+    finish: _Finish
     more_points: _MorePoints | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Finish:
-    """The relaxed design rounded in the elements of the last fit, None where it is not, and what was left out."""
-
-    found: Search | None = None
-    left_out: tuple[dict[str, str], ...] = ()
 
 
 def _finished(
@@ -285,7 +279,7 @@ def _search(
             finishes[attempt] = _finished(mesh, profile, element, at, settings, trace)
             finished = finishes[attempt].found
             if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
-                return _Searched(at, at, settings, 1, np.inf, finished, [NOT_LINEAR])
+                return _Searched(at, at, settings, 1, np.inf, _Finish(finished, (NOT_LINEAR,)))
         if attempt == 0 and _asked(profile, settings) and far_off(at, settings):
             monitor.progress("out of reach", rms_mm=at.relaxed_rms * problem.length, forces=settings.n_points)
             more_points = _more_points(problem, settings, monitor)
@@ -304,8 +298,7 @@ def _search(
     last = before_rounding[-1]
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
-    finish = finishes.get(attempt, _Finish())
-    return _Searched(best, last, settings, attempt + 1, least, finish.found, [*finish.left_out], more_points)
+    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt, _Finish()), more_points)
 
 
 def _rms(found: Search) -> float:

@@ -14,7 +14,7 @@ from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings, at_interface
 from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
-from fab4d.design.objective import shape_error
+from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import change_density
 from fab4d.errors import EquilibriumError
@@ -88,13 +88,19 @@ def test_loading_ends_in_the_fitted_state(inputs: Artifacts, fitted: tuple[str, 
     np.testing.assert_allclose(y @ R.T + t, printed["y"], atol=1e-6)
 
 
+def fit_of(inputs: Artifacts) -> tuple[Equilibria, ObjectiveWeights, FlipSettings]:
+    """What stage refit makes of its inputs, in linear elements."""
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
+    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
+    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    return Equilibria(problem, patches_of(problem, inputs["relaxed"])), weights, settings
+
+
 def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
     """They end in the state that the path of equilibria from the relaxed design leads to, without flips on it."""
-    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
-    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    equilibria, weights, settings = fit_of(inputs)
     smp = inputs["rounded"]["smp"]
-    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
-    given = (equilibria, inputs["relaxed"], smp, weights, refit._flip_settings(inputs, PROFILE, problem, weights))
+    given = (equilibria, inputs["relaxed"], smp, weights, settings)
     monkeypatch.setattr(refit, "influence_near", lambda *_: None)
     monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
     by_path = refit._printed_design(*given).design
@@ -117,11 +123,9 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only where no candidate is found at once; where loading from rest ends if there is no path at all."""
-    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
-    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
+    equilibria, weights, settings = fit_of(inputs)
+    problem = equilibria.problem
     smp = inputs["rounded"]["smp"]
-    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
-    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
     asked: list[bool] = []
 
     def found_by(patience: set[bool]) -> Design:
@@ -151,10 +155,8 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
 
 def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     """Of labels that were spoilt: what is printed comes nearer than they do, or is they where flips mislead."""
-    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
-    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
-    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
-    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    equilibria, weights, settings = fit_of(inputs)
+    problem = equilibria.problem
     spoilt = inputs["rounded"]["smp"].copy()
     spoilt[np.flatnonzero(at_interface(problem, spoilt))[::12]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
@@ -168,10 +170,8 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And taken where they come nearer; not looked for where the error is small enough."""
-    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
-    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
-    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
-    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
+    equilibria, weights, settings = fit_of(inputs)
+    problem = equilibria.problem
     settings = replace(settings, printable=lambda smp: smp)
     enough, never = replace(settings, target_rms=1.0), replace(settings, target_rms=0.0)
     monkeypatch.setattr(refit, "compensated", lambda problem, flips, before, smp, settings: smp)  # noqa: ARG005
@@ -198,9 +198,8 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
 def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
-    equilibria = Equilibria(problem, patches_of(problem, inputs["relaxed"]))
-    weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
+    equilibria, weights, settings = fit_of(inputs)
+    problem = equilibria.problem
     smp = inputs["rounded"]["smp"]
     other = smp.copy()
     other[np.flatnonzero(at_interface(problem, smp))[0]] ^= True
@@ -215,7 +214,6 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     monkeypatch.setattr(refit, "compensated", lambda *_: other)
     monkeypatch.setattr(refit, "_followed", followed)
     monkeypatch.setattr(refit, "_mended", lambda *_: tried.append(None))
-    settings = refit._flip_settings(inputs, PROFILE, problem, weights)
     for share, ways in ((1.001, [other]), (0.999, [other, smp, None])):
         tried.clear()
         target = share * rms(problem, design) / refit.WITHIN_REACH
