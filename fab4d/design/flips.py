@@ -17,7 +17,7 @@ from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_mat
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, Watch, change_density, refit
 from fab4d.errors import EquilibriumError
-from fab4d.mesh.tetmesh import BoolArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # So many tets near the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 1500
@@ -52,11 +52,13 @@ class FlipSettings:
     annealed : labels of less energy that pinch no more than the given ones, or less
 
     target_rms : RMS error, L0, at which nothing more is to be won        max_smp_fraction : of the volume
+    low_rms : RMS error, L0, that is low already, so that the first round that gains little ends it
     """
 
     printable: Printable
     annealed: Annealed
     target_rms: float
+    low_rms: float = 0.0
     max_smp_fraction: float = 1.0
     rounds: int = 15
 
@@ -76,7 +78,8 @@ def polish_labels(
     price, poor = FIRST_PRICE / finer, 0
     found: Influence | None = None
     for seed in range(settings.rounds):
-        if poor == MOST_POOR or shape_error(problem, design.final.y).rms <= settings.target_rms:
+        rms = shape_error(problem, design.final.y).rms
+        if rms <= settings.target_rms or poor >= (1 if rms <= settings.low_rms else MOST_POOR):
             break
         smp = design.rho > 0.5
         if found is None:
@@ -88,7 +91,8 @@ def polish_labels(
         if error_left(found, smp, flipped) ** 2 >= (1 - LEAST_ROUND_GAIN) * error_left(found, smp, smp) ** 2:
             price, poor = price / DEARER, poor + 1
             continue
-        trial = _changed(equilibria, design, flipped)
+        moves = held_moves(found, smp, flipped)
+        trial = _changed(equilibria, design, flipped, moves)
         if trial is None:
             price, poor = DEARER * price, poor + 1
             continue
@@ -100,8 +104,10 @@ def polish_labels(
             price /= CHEAPER
             watch(Search(equilibria, design))
         else:
-            seen = found.view.shape(problem, trial.final.y), found.view.limits.at(trial.median)
-            found, price = found.taught((flipped != smp)[found.tets], *seen), DEARER * price
+            view, made = found.view, moves.ravel()
+            shape = view.shape(problem, trial.final.y) - made @ view.shape_by_held
+            limits = view.limits.at(trial.median) - made @ view.limits_by_held
+            found, price = found.taught((flipped != smp)[found.tets], shape, limits), DEARER * price
     return refit(equilibria, design, weights, watch) if design is not start else start
 
 
@@ -120,7 +126,8 @@ def mended(
     found = influence(equilibria, design, tets, weights)
     price = SURE_PRICE / fineness(problem)
     labels = flip(problem, found, smp, smp, settings, price, STEPS, defect_price=DEFECT_PRICE)
-    changed = _changed(equilibria, design, labels) if (labels != smp).any() else None
+    same = bool((labels == smp).all())
+    changed = None if same else _changed(equilibria, design, labels, held_moves(found, smp, labels))
     return design if changed is None else refit(equilibria, changed, weights, lambda at: None, steps)  # noqa: ARG005
 
 
@@ -146,10 +153,15 @@ def fineness(problem: Problem) -> float:
     return max(problem.n_tets / USUAL_TETS, 1.0)
 
 
-def _changed(equilibria: Equilibria, design: Design, labels: BoolArray) -> Design | None:
-    """The design with these labels (m,) at the same held positions; None where it has no stable equilibrium near."""
+def held_moves(found: Influence, before: BoolArray, smp: BoolArray) -> FloatArray:
+    """(K, 3) moves of the held positions, L0, that go best with the labels smp (m,) instead of `before` (m,)."""
+    return found.after((smp != before)[found.tets]).moves.reshape(-1, 3)
+
+
+def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, moves: FloatArray) -> Design | None:
+    """The design with these labels (m,), its held positions moved; None where it has no stable equilibrium near."""
     try:
-        return change_density(equilibria, design, labels.astype(np.float64), SMALLEST_STEP, stay=True)
+        return change_density(equilibria, design, labels.astype(np.float64), SMALLEST_STEP, stay=True, moves=moves)
     except EquilibriumError:
         return None
 

@@ -173,10 +173,14 @@ class Influence:
         shape = self.shape + self.shape_change[flipped].sum(axis=0)
         return shape, self.beyond + self.limit_change[flipped].sum(axis=0)
 
+    def after(self, flipped: BoolArray) -> Settled:
+        """The held positions settled with the tets `flipped` (k,)."""
+        shape, beyond = self.measures(flipped)
+        return self.settled(float(shape @ shape), self.view.shape_by_held @ shape, beyond)
+
     def left(self, flipped: BoolArray) -> float:
         """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
-        shape, beyond = self.measures(flipped)
-        return float(np.sqrt(self.settled(float(shape @ shape), self.view.shape_by_held @ shape, beyond).squared))
+        return float(np.sqrt(self.after(flipped).squared))
 
     def settled(self, squared: float, toward: FloatArray, beyond: FloatArray) -> Settled:
         """Held positions that settle where the shape has this squared error and gradient (3K,), by an active set.

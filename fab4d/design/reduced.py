@@ -29,8 +29,10 @@ STEPS_AFTER_EXCHANGE = 2
 # Larger pads are taken where the pull on a small one is more than this share of the TPE's shear modulus: it dents the
 # surface and creases it at the rim.
 LARGEST_TRACTION = 0.25
-# While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance.
-ROUNDING_LOSS = 1.5
+# While rounding, the error counts 1 at this multiple of the relaxed one, if that is below the tolerance, but not below
+# the second share of it: for errors that are asked to be far smaller than anybody needs, labels turn fine-grained, and
+# print worse.
+ROUNDING_LOSS, LEAST_SCALE = 1.5, 0.25
 # While there is too much SMP, its price grows by this power of the growth of lam_round.
 DEARER = 0.86
 # So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
@@ -316,7 +318,8 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
 
 def _rounding_weights(at: Search, settings: ReducedSettings) -> ObjectiveWeights:
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
-    scale = min(settings.weights.error_scale, ROUNDING_LOSS * at.relaxed_rms)
+    tolerance = settings.weights.error_scale
+    scale = float(np.clip(ROUNDING_LOSS * at.relaxed_rms, LEAST_SCALE * tolerance, tolerance))
     return settings.weights.replace(error_scale=scale, lam_SMP=at.lam_SMP, lam_round=at.lam_round)
 
 
@@ -375,11 +378,17 @@ def _decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
 
 
 def change_density(
-    equilibria: Equilibria, design: Design, rho: FloatArray, smallest: float = 1e-3, stay: bool = False
+    equilibria: Equilibria,
+    design: Design,
+    rho: FloatArray,
+    smallest: float = 1e-3,
+    stay: bool = False,
+    moves: FloatArray | None = None,
 ) -> Design:
     """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
 
     smallest : share of the way that a step may come down to        stay : see `newton`
+    moves : (K, 3) of the held positions, made along with the density
     Raises EquilibriumError when the path ends before.
     """
     start, done, step = design.rho, 0.0, 1.0
@@ -387,8 +396,9 @@ def change_density(
     while done < 1.0:
         aim = min(1.0, done + step)
         mixed = start + aim * (rho - start)
+        moved = held if moves is None else held + aim * moves
         x, forces, y = design.median.x, design.median.forces, design.final.y
-        trial = equilibrate(equilibria, mixed, held, x, forces, y, stay=stay)
+        trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay)
         if trial is not None:
             design, done, step = trial, aim, 2 * step
         else:

@@ -80,7 +80,8 @@ def _far_faces(
         rate = np.einsum("rfi,ri->rf", gradients[at], directions[going])
         start = np.einsum("rfi,ri->rf", gradients[at], origins[going] - X[tets[at, 0]])
         start[:, 0] += 1.0
-        with np.errstate(divide="ignore"):
+        # A ray that lies in a face neither nears nor leaves it: 0 / 0, which is not taken.
+        with np.errstate(divide="ignore", invalid="ignore"):
             exit_at = np.where(rate < -_MARGIN * np.abs(rate).max(axis=1, keepdims=True), -start / rate, np.inf)
         face = exit_at.argmin(axis=1)
         reached = exit_at[np.arange(len(going)), face]

@@ -1,11 +1,12 @@
 """A near 0/1 design as it will be printed, labels repaired and held positions fitted, and what speaks against it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from fab4d.design.finish import carried_in
 from fab4d.design.flips import polish_labels
 from fab4d.design.forward import program, same_shape
 from fab4d.design.gauss_newton import Design
@@ -17,7 +18,7 @@ from fab4d.fabrication.labels import ambiguous_fraction, isolated_fraction, roun
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.tetmesh import BoolArray
 from fab4d.stages._repair import repaired
-from fab4d.stages.refit import flip_settings, limit_reasons
+from fab4d.stages.refit import FEW_STEPS, flip_settings, limit_reasons
 from fab4d.stages.threshold import acceptance_reasons
 
 # Flips win back a part of what rounding costs: beyond this multiple of the tolerance they do not reach it.
@@ -57,6 +58,21 @@ def as_printed(
     if good_enough < shape_error(problem, design.final.y).rms < HOPELESS * weights.error_scale:
         design = polish_labels(found.equilibria, design, weights, settings, lambda at: None)  # noqa: ARG005
     return Printed(design.rho > 0.5, shape_error(problem, design.final.y).rms, design)
+
+
+def refitted_in(problem: Problem, found: Search, printed: Design, weights: ObjectiveWeights) -> float:
+    """RMS error, L0, of the printed labels of `found` in the elements of `problem`, which are others of the same mesh.
+
+    Held positions are fitted by a few steps where it is above the tolerance. inf where there is no equilibrium near.
+    """
+    carried = carried_in(problem, replace(found, design=printed))
+    if carried is None:
+        return np.inf
+    rms = shape_error(problem, carried.design.final.y).rms
+    if rms <= weights.error_scale:
+        return rms
+    fitted = refit(carried.equilibria, carried.design, weights, lambda at: None, FEW_STEPS)  # noqa: ARG005
+    return shape_error(problem, fitted.final.y).rms
 
 
 def smp_share(problem: Problem, smp: BoolArray) -> float:

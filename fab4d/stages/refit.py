@@ -8,7 +8,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, mended, polish_labels
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, held_moves, mended, polish_labels
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -37,6 +37,8 @@ ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
 # So they do where the relaxed design is out of reach of the tolerance.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
+# At this share of the tolerance flips end with the first round that gains little.
+LOW_ERROR = 0.15
 # Some rounds of flips bring a design from up to this multiple of the error at which they end there.
 WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
@@ -138,12 +140,13 @@ def _ways(
 
     smp : (m,) its repair
     """
-    flips = influence_near(equilibria, before, smp, weights)
+    flips, rounded = influence_near(equilibria, before, smp, weights), before.rho > 0.5
     if flips is not None:
-        better = compensated(equilibria.problem, flips, before.rho > 0.5, smp, settings)
+        better = compensated(equilibria.problem, flips, rounded, smp, settings)
         if (better != smp).any():
-            yield _followed(equilibria, before, better, weights)
-    yield _followed(equilibria, before, smp, weights)
+            yield _followed(equilibria, before, better, weights, held_moves(flips, rounded, better))
+    moves = None if flips is None else held_moves(flips, rounded, smp)
+    yield _followed(equilibria, before, smp, weights, moves)
     yield _mended(equilibria, before, weights, settings)
 
 
@@ -161,15 +164,21 @@ def _mended(
 
 
 def _followed(
-    equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights, patient: bool = False
+    equilibria: Equilibria,
+    before: Design,
+    smp: BoolArray,
+    weights: ObjectiveWeights,
+    moves: FloatArray | None = None,
+    patient: bool = False,
 ) -> _Printed | None:
     """The labels smp (m,); None where no path of equilibria leads to them.
 
+    moves : (K, 3) of the held positions on the way
     patient : whether small steps are made too and the path may lead past unstable states, which takes minutes
     """
     smallest = PATIENT_STEP if patient else SMALLEST_STEP
     try:
-        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient)
+        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient, moves=moves)
     except EquilibriumError:
         return None
     if not equilibria.patches.count:
@@ -228,6 +237,7 @@ def _flip_settings(
     relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
     down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
+    settings = replace(settings, low_rms=LOW_ERROR * weights.error_scale)
     few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * weights.error_scale
     return replace(settings, rounds=FEW_ROUNDS) if few else settings
 

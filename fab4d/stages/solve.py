@@ -20,7 +20,7 @@ from fab4d.stages._coarse import MANY_TETS, coarse_for
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds, tolerance_of
 from fab4d.stages._element import element_for
 from fab4d.stages._least import RELAXED, least_smp
-from fab4d.stages._printed import as_printed
+from fab4d.stages._printed import as_printed, refitted_in
 from fab4d.stages._repair import MORE_REPAIRS, repaired
 from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages._starts import Starts
@@ -37,6 +37,8 @@ ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
 # A design rounded in the elements of the last fit needs no other, if its RMS error is at most this share of the
 # tolerance: repairs of its labels cost less than the rest.
 CERTAINLY_ENOUGH = 0.5
+# Flips of the last fit bring the error of a printed design down from this multiple of the tolerance.
+FLIPS_WIN_BACK = 1.5
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
 # Linear elements round a design as well as quadratic ones, and much faster, where its error in quadratic ones is at
 # most this multiple of that in linear ones, held positions unchanged.
@@ -287,8 +289,8 @@ def _search(
         if _hopeless(profile, settings, found):
             best = best or found
             break
-        start, weights = None, settings.weights
-        rms = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, weights.error_scale).rms
+        start = None
+        rms = _printed_rms(problem, mesh, profile, element, settings, found)
         if best is None or rms < least:
             best, least = found, rms
             monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
@@ -299,6 +301,28 @@ def _search(
     if enough and attempt not in finishes:
         finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
     return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt, _Finish()), more_points)
+
+
+def _printed_rms(
+    problem: Problem,
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    element: str,
+    settings: ReducedSettings,
+    found: Search,
+) -> float:
+    """RMS error, L0, of a rounded design as printed.
+
+    In the elements of the last fit where these err by more than flips win back: linear ones lock in thin limbs, and
+    tell nothing about labels that hold a limb by single tets.
+    """
+    weights = settings.weights
+    tolerance = weights.error_scale
+    printed = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, tolerance)
+    if element == "linear" or printed.design is None or printed.rms > tolerance:
+        return printed.rms
+    rms = refitted_in(problem_of(mesh, profile["materials"], element), found, printed.design, weights)
+    return rms if rms > FLIPS_WIN_BACK * tolerance else printed.rms
 
 
 def _rms(found: Search) -> float:

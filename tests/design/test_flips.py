@@ -105,7 +105,7 @@ def test_flips_become_dearer_where_they_have_no_equilibrium(monkeypatch: pytest.
     equilibria, energies = two_patches(problem), list[FlipEnergy]()
     design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
 
-    def lost(at: Equilibria, before: Design, rho: np.ndarray, smallest: float, stay: bool) -> Design:  # noqa: ARG001
+    def lost(*args: object, **named: object) -> Design:  # noqa: ARG001
         msg = "none"
         raise EquilibriumError(msg)
 
@@ -140,6 +140,39 @@ def test_flips_become_cheaper_where_rounds_come_true_or_promise_nothing(monkeypa
     assert len(energies) == flips.MOST_POOR
     for before, after in itertools.pairwise(energies):
         assert relative(before) == pytest.approx(flips.DEARER * relative(after))
+
+
+def test_where_the_error_is_low_the_first_poor_round_ends_it() -> None:
+    problem = bar(degrees=30.0)
+    equilibria, energies = two_patches(problem), list[FlipEnergy]()
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    stuck = replace(recording(freely(problem), energies), printable=lambda smp: design.rho > 0.5)  # noqa: ARG005
+    rms = shape_error(problem, design.final.y).rms
+    for low, rounds in ((1.01 * rms, 1), (0.99 * rms, flips.MOST_POOR)):
+        energies.clear()
+        polish_labels(equilibria, design, WEIGHTS, replace(stuck, low_rms=low), lambda at: None)  # noqa: ARG005
+        assert len(energies) == rounds
+
+
+def test_held_positions_move_along_with_flips() -> None:
+    """The error after some flips is nearer to what a fit leaves of it than with the positions as they were."""
+    problem = bar(cells=(6, 3, 2), degrees=40.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    before = held_design(equilibria, smp.astype(float), problem.X_temp)
+    design = refit(equilibria, before, WEIGHTS, lambda at: None)  # noqa: ARG005
+    found, labels = at_all_tets(equilibria, design), smp.copy()
+    labels[np.flatnonzero(at_interface(problem, smp))[::4]] ^= True
+    moves = flips.held_moves(found, smp, labels)
+    assert moves.shape == (2, 3)
+    assert np.abs(moves).max() > 0
+    still, moved = (flips._changed(equilibria, design, labels, each) for each in (0 * moves, moves))
+    assert still is not None
+    assert moved is not None
+    held = held_positions(equilibria, moved.median)
+    np.testing.assert_allclose(held, held_positions(equilibria, design.median) + moves, atol=1e-9)
+    fitted = refit(equilibria, still, WEIGHTS, lambda at: None)  # noqa: ARG005
+    errors = [shape_error(problem, each.final.y).rms for each in (fitted, moved, still)]
+    assert errors[1] - errors[0] < 0.3 * (errors[2] - errors[0])
 
 
 def test_a_part_without_smp_is_left_as_it_is() -> None:
@@ -239,7 +272,7 @@ def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
     design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
     smp = design.rho > 0.5
 
-    def worse(at: Equilibria, before: Design, rho: np.ndarray, smallest: float, stay: bool) -> Design:  # noqa: ARG001
+    def worse(at: Equilibria, before: Design, rho: np.ndarray, *rest: object, **named: object) -> Design:  # noqa: ARG001
         tried.append(frozenset(np.flatnonzero((rho > 0.5) != smp)))
         return held_design(equilibria, rho, problem.body.X)
 

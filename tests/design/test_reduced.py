@@ -328,6 +328,17 @@ def test_rounding_ends_where_steps_decide_nothing(
     assert len(taken) == steps
 
 
+@pytest.mark.parametrize(("relaxed", "scale"), [(0.01, 0.25), (0.3, 0.45), (0.9, 1.0), (np.inf, 1.0)])
+def test_rounding_spends_little_more_than_the_relaxed_error_but_asks_for_no_tiny_one(
+    searched: list[Search], relaxed: float, scale: float
+) -> None:
+    """In shares of the tolerance."""
+    settings = settings_for(searched[-1].equilibria.problem)
+    tolerance = settings.weights.error_scale
+    weights = reduced._rounding_weights(replace(searched[-1], relaxed_rms=relaxed * tolerance), settings)
+    assert weights.error_scale == pytest.approx(scale * tolerance)
+
+
 def test_densities_left_undecided_are_rounded_at_once(truth: Truth, searched: list[Search]) -> None:
     """Where the steps have come to nothing; but only up to a share, if one is given."""
     last, problem = searched[-1], truth.problem

@@ -131,12 +131,12 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
     def found_by(patience: set[bool]) -> Design:
         asked.clear()
 
-        def hard(at: Equilibria, before: Design, rho: FloatArray, smallest: float, stay: bool) -> Design:
-            asked.append(not stay)
+        def hard(at: Equilibria, before: Design, rho: FloatArray, smallest: float, **named: Any) -> Design:
+            asked.append(not named["stay"])
             if asked[-1] not in patience:
                 msg = "none"
                 raise EquilibriumError(msg)
-            return change_density(at, before, rho, smallest, stay=stay)
+            return change_density(at, before, rho, smallest, **named)
 
         monkeypatch.setattr(refit, "change_density", hard)
         return refit._printed_design(equilibria, inputs["relaxed"], smp, weights, settings).design

@@ -16,7 +16,7 @@ from fab4d.io.scene import Scene, Weights, load_scene
 from fab4d.runner.table import stage_table
 from fab4d.stages import check, solve, threshold, tradeoff
 from fab4d.stages._design import problem_of
-from fab4d.stages._printed import as_printed, faults
+from fab4d.stages._printed import as_printed, faults, refitted_in
 from fab4d.stages._search import search_from
 from fab4d.stages.monitor import SilentMonitor
 
@@ -141,6 +141,21 @@ def judged(scene: Scene, checked: dict[str, Any], kept: Kept) -> tuple[Any, ...]
     found = search_from(problem, kept[1].saved["3x1"])
     weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
     return problem, found, as_printed(problem, checked["mesh"], scene.printer, scene.goal, weights, found, np.inf)
+
+
+def test_printed_labels_are_refitted_in_other_elements(
+    scene: Scene, checked: dict[str, Any], judged: tuple[Any, ...]
+) -> None:
+    """A fit is made where the tolerance is missed; in the same elements nothing changes."""
+    problem, found, printed = judged
+    quadratic = problem_of(checked["mesh"], scene.materials, "quadratic")
+    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    same = refitted_in(problem, found, printed.design, weights.replace(error_scale=1.0))
+    assert same == pytest.approx(printed.rms, rel=1e-3)
+    carried = refitted_in(quadratic, found, printed.design, weights.replace(error_scale=1.0))
+    fitted = refitted_in(quadratic, found, printed.design, weights.replace(error_scale=0.5 * carried))
+    assert abs(carried / printed.rms - 1) > 0.02
+    assert fitted < carried
 
 
 @pytest.mark.parametrize(
