@@ -30,6 +30,9 @@ ELEMENT_ORDER = 4
 # grid convergence index where the order is known.
 SAFETY = 1.25
 _TOLERANCE, _ITERATIONS = 1e-8, 20
+# On a refined mesh each iteration takes seconds; nine were enough wherever an equilibrium was found, and more follow
+# short waves in which finer elements buckle.
+_REFINED_ITERATIONS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +128,7 @@ def _refined_forces(
     faces = refined_faces(patch_arrays["patch_faces"], edges, len(mesh["X"]))
     patches = patches_from_faces(problem, patch_arrays["patch_center"], faces, 4 * patch_arrays["patch_offsets"])
     x = on_children(held.equilibria.problem.body.elements, held.x, problem.body.elements, problem.n_nodes)
-    return _forces_at(problem, patches, held, np.repeat(held.rho, 8), x)
+    return _forces_at(problem, patches, held, np.repeat(held.rho, 8), x, _REFINED_ITERATIONS)
 
 
 def _fine(mesh: Mapping[str, np.ndarray]) -> tuple[FloatArray, np.ndarray, np.ndarray]:
@@ -134,10 +137,12 @@ def _fine(mesh: Mapping[str, np.ndarray]) -> tuple[FloatArray, np.ndarray, np.nd
     return with_midpoints(mesh["X"], fine.edges), fine.tets, fine.edges
 
 
-def _forces_at(problem: Problem, patches: Patches, held: Held, rho: FloatArray, x: FloatArray) -> FloatArray | None:
+def _forces_at(
+    problem: Problem, patches: Patches, held: Held, rho: FloatArray, x: FloatArray, iterations: int = _ITERATIONS
+) -> FloatArray | None:
     """(K, 3) forces at the same hold positions in another discretisation, None without an equilibrium near x."""
     equilibria = Equilibria(problem, patches)
-    median = equilibria.solve_median(rho, held.positions, x, held.forces, _TOLERANCE, _ITERATIONS)
+    median = equilibria.solve_median(rho, held.positions, x, held.forces, _TOLERANCE, iterations)
     return median.forces if median.solution.converged else None
 
 
