@@ -88,11 +88,12 @@ def polish_labels(
                 break
             found = influence(equilibria, design, tets, plain, int(MOST_CANDIDATES * finer))
         flipped = settings.printable(flip(problem, found, smp, smp, settings, price, STEPS, seed))
-        if error_left(found, smp, flipped) ** 2 >= (1 - LEAST_ROUND_GAIN) * error_left(found, smp, smp) ** 2:
+        changed = (flipped != smp)[found.tets]
+        settled = found.after(changed)
+        if settled.squared >= (1 - LEAST_ROUND_GAIN) * found.after(np.zeros_like(changed)).squared:
             price, poor = price / DEARER, poor + 1
             continue
-        moves = held_moves(found, smp, flipped)
-        trial = _changed(equilibria, design, flipped, moves)
+        trial = _changed(equilibria, design, flipped, settled.moves)
         if trial is None:
             price, poor = DEARER * price, poor + 1
             continue
@@ -104,10 +105,10 @@ def polish_labels(
             price /= CHEAPER
             watch(Search(equilibria, design))
         else:
-            view, made = found.view, moves.ravel()
-            shape = view.shape(problem, trial.final.y) - made @ view.shape_by_held
-            limits = view.limits.at(trial.median) - made @ view.limits_by_held
-            found, price = found.taught((flipped != smp)[found.tets], shape, limits), DEARER * price
+            view = found.view
+            shape = view.shape(problem, trial.final.y) - settled.moves @ view.shape_by_held
+            limits = view.limits.at(trial.median) - settled.moves @ view.limits_by_held
+            found, price = found.taught(changed, shape, limits), DEARER * price
     return refit(equilibria, design, weights, watch) if design is not start else start
 
 
@@ -126,8 +127,9 @@ def mended(
     found = influence(equilibria, design, tets, weights)
     price = SURE_PRICE / fineness(problem)
     labels = flip(problem, found, smp, smp, settings, price, STEPS, defect_price=DEFECT_PRICE)
-    same = bool((labels == smp).all())
-    changed = None if same else _changed(equilibria, design, labels, held_moves(found, smp, labels))
+    if (labels == smp).all():
+        return design
+    changed = _changed(equilibria, design, labels, held_moves(found, smp, labels))
     return design if changed is None else refit(equilibria, changed, weights, lambda at: None, steps)  # noqa: ARG005
 
 
@@ -154,8 +156,8 @@ def fineness(problem: Problem) -> float:
 
 
 def held_moves(found: Influence, before: BoolArray, smp: BoolArray) -> FloatArray:
-    """(K, 3) moves of the held positions, L0, that go best with the labels smp (m,) instead of `before` (m,)."""
-    return found.after((smp != before)[found.tets]).moves.reshape(-1, 3)
+    """(3K,) moves of the held positions, L0, that go best with the labels smp (m,) instead of `before` (m,)."""
+    return found.after((smp != before)[found.tets]).moves
 
 
 def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, moves: FloatArray) -> Design | None:

@@ -388,7 +388,7 @@ def change_density(
     """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
 
     smallest : share of the way that a step may come down to        stay : see `newton`
-    moves : (K, 3) of the held positions, made along with the density
+    moves : (3K,) of the held positions, made along with the density
     Raises EquilibriumError when the path ends before.
     """
     start, done, step = design.rho, 0.0, 1.0
@@ -396,7 +396,7 @@ def change_density(
     while done < 1.0:
         aim = min(1.0, done + step)
         mixed = start + aim * (rho - start)
-        moved = held if moves is None else held + aim * moves
+        moved = held if moves is None else held + aim * moves.reshape(-1, 3)
         x, forces, y = design.median.x, design.median.forces, design.final.y
         trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay)
         if trial is not None:

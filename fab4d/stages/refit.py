@@ -173,7 +173,7 @@ def _followed(
 ) -> _Printed | None:
     """The labels smp (m,); None where no path of equilibria leads to them.
 
-    moves : (K, 3) of the held positions on the way
+    moves : (3K,) of the held positions on the way
     patient : whether small steps are made too and the path may lead past unstable states, which takes minutes
     """
     smallest = PATIENT_STEP if patient else SMALLEST_STEP

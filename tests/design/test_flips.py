@@ -163,13 +163,13 @@ def test_held_positions_move_along_with_flips() -> None:
     found, labels = at_all_tets(equilibria, design), smp.copy()
     labels[np.flatnonzero(at_interface(problem, smp))[::4]] ^= True
     moves = flips.held_moves(found, smp, labels)
-    assert moves.shape == (2, 3)
+    assert moves.shape == (6,)
     assert np.abs(moves).max() > 0
     still, moved = (flips._changed(equilibria, design, labels, each) for each in (0 * moves, moves))
     assert still is not None
     assert moved is not None
     held = held_positions(equilibria, moved.median)
-    np.testing.assert_allclose(held, held_positions(equilibria, design.median) + moves, atol=1e-9)
+    np.testing.assert_allclose(held, held_positions(equilibria, design.median) + moves.reshape(2, 3), atol=1e-9)
     fitted = refit(equilibria, still, WEIGHTS, lambda at: None)  # noqa: ARG005
     errors = [shape_error(problem, each.final.y).rms for each in (fitted, moved, still)]
     assert errors[1] - errors[0] < 0.3 * (errors[2] - errors[0])
@@ -282,6 +282,32 @@ def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
     assert same is design
     assert 1 < len(tried) <= flips.MOST_POOR
     assert len(set(tried)) == len(tried)
+
+
+def test_what_is_taught_is_what_flips_do_at_the_same_held_positions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the held positions moved along with them."""
+    problem = bar(cells=(6, 3, 2), degrees=40.0)
+    equilibria, smp, seen = two_patches(problem), upper_half(problem), []
+    design = held_design(equilibria, smp.astype(float), problem.X_temp)
+    values, change, teach = iter([0.0, 1.0]), flips._changed, Influence.taught
+
+    def changed(at: Equilibria, before: Design, labels: np.ndarray, moves: np.ndarray) -> Design | None:
+        seen.append((change(at, before, labels, 0 * moves), moves))
+        return change(at, before, labels, moves)
+
+    def taught(self: Influence, flipped: np.ndarray, shape: np.ndarray, beyond: np.ndarray) -> Influence:
+        still, moves = seen[-1]
+        moved = np.linalg.norm(moves @ self.view.shape_by_held)
+        assert moved > 0
+        assert np.linalg.norm(shape - self.view.shape(problem, still.final.y)) < 0.5 * moved
+        return teach(self, flipped, shape, beyond)
+
+    monkeypatch.setattr(flips, "_changed", changed)
+    monkeypatch.setattr(Influence, "taught", taught)
+    monkeypatch.setattr(flips, "evaluate", lambda *_: next(values))
+    monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+    polish_labels(equilibria, design, WEIGHTS, replace(freely(problem), rounds=1), lambda at: None)  # noqa: ARG005
+    assert len(seen) == 1
 
 
 def test_of_smaller_tets_more_are_candidates_for_less_each(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -207,7 +207,9 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     design = change_density(equilibria, before, other.astype(np.float64))
     tried: list[BoolArray | None] = []
 
-    def followed(_at: Equilibria, _before: Design, labels: BoolArray, *_: Any) -> refit._Printed:
+    def followed(*given: Any) -> refit._Printed:
+        _at, _before, labels, _weights, moves = given
+        assert np.abs(moves).max() > 0
         tried.append(labels)
         return refit._Printed(design, design)
 
@@ -277,10 +279,12 @@ def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts])
 def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Below 0.15 of the tolerance with little patience."""
     targets = []
 
     def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001
         targets.append(settings.target_rms * equilibria.problem.length)
+        assert settings.low_rms == pytest.approx(0.15 * weights.error_scale)
         return design
 
     monkeypatch.setattr(refit, "polish_labels", spy)
