@@ -18,12 +18,19 @@ from fab4d.design.reduced import (
     ReducedSettings,
     Search,
     decided,
+    decided_by_and_by,
+    undecided_fraction,
 )
+from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import FloatArray
 
-# So many steps in a row that are not taken, or only with the largest damping, end the rounding: the equilibria turn
-# unstable on its way.
-MOST_HELD_BACK = 3
+# So many steps in a row end the rounding that are not taken, or only with the largest damping and leave more than this
+# share of the undecided tets: the equilibria turn unstable on its way.
+MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
+# After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
+# and by, the surest first, if they are at most this share: that takes fewer steps than to raise the price of all of
+# them until the last is 0 or 1, and leaves a smaller error.
+HARD_STEPS, FEW_LEFT = 2, 0.1
 # Up to this share of undecided tets is rounded at once where the steps come to nothing; with more left, the design that
 # other elements have rounded is the better one.
 LAST_SHARE = 0.05
@@ -73,13 +80,32 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
     settings = replace(settings, relax_iterations=RELAX_ITERATIONS, round_growth=ROUND_GROWTH)
-    L, held_back = smoothness_matrix(problem), 0
+    L, hard, held_back, tried = smoothness_matrix(problem), 0, 0, False
     while at.phase is not Phase.DONE:
-        phase = at.phase
-        at = STEPS[phase](replace(at, accepted=True), settings, L)
-        watch(phase.value, at)
-        hard = phase is Phase.ROUND and (not at.accepted or at.damping >= LARGEST_DAMPING)
-        held_back = held_back + 1 if hard else 0
+        before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
+        watch(before.phase.value, at)
+        left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
+        hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
+        held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
+        if settings.decide_in_steps and not tried and hard >= HARD_STEPS and left <= FEW_LEFT:
+            early, tried = _decided_early(at, settings), True
+            if early is not None:
+                watch(before.phase.value, early)
+                return early
         if held_back == MOST_HELD_BACK:
             break
     return decided(at, settings, LAST_SHARE)
+
+
+def _is_hard(after: Search) -> bool:
+    """Whether a step was not taken, or only with the largest damping."""
+    return not after.accepted or after.damping >= LARGEST_DAMPING
+
+
+def _decided_early(at: Search, settings: ReducedSettings) -> Search | None:
+    """The state with the rest decided by and by; None where no equilibria lead there."""
+    try:
+        design = decided_by_and_by(at, settings)
+    except EquilibriumError:
+        return None
+    return None if design is None else replace(at, design=design, phase=Phase.DONE)

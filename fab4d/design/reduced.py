@@ -45,6 +45,8 @@ FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
 # that promises less than the second.
 SLOW_REFIT, LEAST_PROMISE, REFIT_TRIES = 1e-2, 1e-3, 12
+# So many steps on the way to other densities lead on before a longer one is tried: one that failed fails mostly again.
+BEFORE_LONGER = 3
 # The smallest number of points is looked for from here.
 FIRST_COUNT = 4
 
@@ -346,14 +348,14 @@ def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search 
     if left > most:
         return None
     try:
-        design = _decided_by_and_by(at, settings) if settings.decide_in_steps else None
+        design = decided_by_and_by(at, settings) if settings.decide_in_steps else None
         design = design or change_density(at.equilibria, at.design, np.round(at.design.rho))
     except EquilibriumError:
         return None
     return replace(at, design=design, phase=Phase.DONE)
 
 
-def _decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
+def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
     """The surest densities rounded first; the others and the held positions make up for it.
 
     None where there is no equilibrium on the way.
@@ -389,9 +391,11 @@ def change_density(
 
     smallest : share of the way that a step may come down to        stay : see `newton`
     moves : (3K,) of the held positions, made along with the density
+    A length that has failed is not tried again before BEFORE_LONGER steps of half of it have led on.
     Raises EquilibriumError when the path ends before.
     """
     start, done, step = design.rho, 0.0, 1.0
+    failed, led_on = np.inf, 0
     held = held_positions(equilibria, design.median)
     while done < 1.0:
         aim = min(1.0, done + step)
@@ -400,9 +404,11 @@ def change_density(
         x, forces, y = design.median.x, design.median.forces, design.final.y
         trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay)
         if trial is not None:
-            design, done, step = trial, aim, 2 * step
+            design, done, led_on = trial, aim, led_on + 1
+            if 2 * step < failed or led_on == BEFORE_LONGER:
+                step, failed = 2 * step, np.inf
         else:
-            step /= 2
+            step, failed, led_on = step / 2, step, 0
         if step < smallest:
             msg = "the printed labels have no equilibrium near that of the relaxed design"
             raise EquilibriumError(msg)

@@ -1,18 +1,23 @@
 """A relaxed design of linear tets, carried over to quadratic ones and rounded there."""
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bars import bar
 
+from fab4d.design import finish
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.finish import LAST_SHARE, carried_in, carried_over, rounded_from
+from fab4d.design.finish import FEW_LEFT, LAST_SHARE, MOST_HELD_BACK, carried_in, carried_over, rounded_from
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed, undecided_fraction
+from fab4d.design.reduced import LARGEST_DAMPING, Phase, ReducedSettings, Search, relaxed, undecided_fraction
 from fab4d.design.turning import Turning
+from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
 
 TOLERANCE = 5e-3
@@ -93,3 +98,84 @@ def test_without_an_equilibrium_nothing_is_rounded(found: Search) -> None:
     patches = found.equilibria.patches
     equilibria = Equilibria(mirrored, patches_from_faces(mirrored, patches.centers, patches.faces, patches.offsets))
     assert carried_over(equilibria, found.design.rho, far, far, found.design.median.forces) is None
+
+
+@pytest.fixture
+def all_steps_hard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finish, "_is_hard", lambda _: True)
+    monkeypatch.setattr(finish, "MOST_HELD_BACK", 100)
+
+
+@pytest.mark.usefixtures("all_steps_hard")
+def test_the_last_few_tets_are_decided_by_and_by_where_steps_are_hard(found: Search, quadratic: Problem) -> None:
+    """As soon as a step leaves few of them: all states before it leave more."""
+    shown: list[Search] = []
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    at = rounded_from(carried, settings_for(quadratic), lambda _, at: shown.append(at))
+    assert at is shown[-1]
+    shares = [undecided_fraction(state.design.rho) for state in shown]
+    assert min(shares[:-2]) > FEW_LEFT >= shares[-2] > shares[-1] == 0
+    assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
+
+
+@pytest.mark.usefixtures("all_steps_hard")
+@pytest.mark.parametrize("fails", [True, False])
+def test_rounding_goes_on_where_the_last_few_tets_cannot_be_decided(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    asked = []
+
+    def no_equilibrium(*_: object) -> None:
+        asked.append(1)
+        if fails:
+            msg = "none"
+            raise EquilibriumError(msg)
+
+    monkeypatch.setattr(finish, "decided_by_and_by", no_equilibrium)
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    at = rounded_from(carried, settings_for(quadratic), lambda *_: None)
+    assert len(asked) == 1
+    assert at is not None
+    assert set(np.unique(np.round(at.design.rho, 2))) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(("decide_in_steps", "hard"), [(False, [True]), (True, [False]), (True, [True, False])])
+def test_tets_are_not_decided_by_and_by_where_steps_lead_on_or_the_mesh_is_large(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, decide_in_steps: bool, hard: list[bool]
+) -> None:
+    """Single hard steps are none in a row."""
+    steps = itertools.cycle(hard)
+    monkeypatch.setattr(finish, "_is_hard", lambda _: next(steps))
+    monkeypatch.setattr(finish, "MOST_HELD_BACK", 100)
+    monkeypatch.setattr(finish, "decided_by_and_by", lambda *_: pytest.fail("decided"))
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    settings = replace(settings_for(quadratic), decide_in_steps=decide_in_steps)
+    assert rounded_from(carried, settings, lambda *_: None) is not None
+
+
+@pytest.mark.parametrize(("share_left", "steps"), [(0.95, MOST_HELD_BACK), (0.8, None)])
+def test_hard_steps_that_decide_little_end_the_rounding(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, share_left: float, steps: int | None
+) -> None:
+    """Those that leave a smaller share of the undecided tets go on."""
+    made = []
+
+    def round_step(at: Search, *_: object) -> Search:
+        made.append(1)
+        rho = at.design.rho.copy()
+        left = np.flatnonzero((rho > 0) & (rho < 1))
+        rho[left[: max(int((1 - share_left) * len(left)), 1)]] = 1.0
+        last = Phase.DONE if len(left) < 30 else Phase.ROUND
+        return replace(at, design=replace(at.design, rho=rho), accepted=True, damping=LARGEST_DAMPING, phase=last)
+
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    carried = replace(carried, design=replace(carried.design, rho=np.full(quadratic.n_tets, 0.5)))
+    monkeypatch.setattr(
+        finish, "STEPS", {Phase.RELAX: lambda at, *_: replace(at, phase=Phase.ROUND), Phase.ROUND: round_step}
+    )
+    rounded_from(carried, settings_for(quadratic), lambda *_: None)
+    assert (len(made) == MOST_HELD_BACK) == (steps is not None)

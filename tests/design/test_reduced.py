@@ -371,6 +371,28 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     assert rms(problem, by_and_by.design) < rms(problem, at_once.design)
 
 
+def test_a_step_to_other_densities_that_failed_is_not_tried_again_soon(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Shares of the way that are aimed at where steps of more than a sixteenth lead nowhere at first."""
+    start, tried, at = truth.design, list[float](), [0.0]
+
+    def equilibrate(_equilibria: Equilibria, rho: np.ndarray, *_: object, **__: object) -> Design | None:
+        aim = float(rho[0])
+        tried.append(aim)
+        if aim - at[0] > 1 / 16 and at[0] < 0.25:
+            return None
+        at[0] = aim
+        return replace(start, rho=rho)
+
+    monkeypatch.setattr(reduced, "equilibrate", equilibrate)
+    n = truth.problem.n_tets
+    found = change_density(truth.equilibria, replace(start, rho=np.zeros(n)), np.ones(n))
+    np.testing.assert_array_equal(found.rho, 1.0)
+    sixteenths = [16, 8, 4, 2, 1, 2, 3, 5, 4, 5, 6, 8, 12, 16]
+    np.testing.assert_allclose(16 * np.array(tried), sixteenths)
+
+
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
     """With the true labels and points there is one answer, and the error goes to rounding."""
     problem, equilibria, true = truth.problem, truth.equilibria, truth.design
