@@ -34,7 +34,7 @@ LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors t
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
 ATTEMPTS = ((1.0, 1.0), (2.5, 0.4), (6.0, 0.2))
-# A design rounded in the elements of the last fit needs no other, if its RMS error is at most this share of the
+# A design rounded in the elements of the last fit prints well enough, if its RMS error is at most this share of the
 # tolerance: repairs of its labels cost less than the rest.
 CERTAINLY_ENOUGH = 0.5
 # Flips of the last fit bring the error of a printed design down from this multiple of the tolerance.
@@ -171,10 +171,14 @@ class _MorePoints:
 
 @dataclass(frozen=True, eq=False)
 class _Finish:
-    """The relaxed design rounded in the elements of the last fit, None where it is not, and what was left out."""
+    """The relaxed design rounded in the elements of the last fit, None where it is not, and what was left out.
+
+    printed_rms : RMS error as printed, L0; of the design itself where that is certainly enough
+    """
 
     found: Search | None = None
     left_out: tuple[dict[str, str], ...] = ()
+    printed_rms: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,10 +282,10 @@ def _search(
         if attempt == 0 and _asked(profile, settings):
             at = starts.best(at, _watch(attempt, None, trace, monitor, before_rounding))
         if attempt == 0 and enough and at.phase is Phase.ROUND and at.iteration == 0:
-            finishes[attempt] = _finished(mesh, profile, element, at, settings, trace)
-            finished = finishes[attempt].found
-            if finished is not None and _rms(finished) <= CERTAINLY_ENOUGH * settings.weights.error_scale:
-                return _Searched(at, at, settings, 1, np.inf, _Finish(finished, (NOT_LINEAR,)))
+            finish = _judged(_finished(mesh, profile, element, at, settings, trace), mesh, profile, settings)
+            finishes[attempt] = finish
+            if finish.printed_rms <= settings.weights.error_scale:
+                return _Searched(at, at, settings, 1, np.inf, replace(finish, left_out=(NOT_LINEAR,)))
         if attempt == 0 and _asked(profile, settings) and far_off(at, settings):
             monitor.progress("out of reach", rms_mm=at.relaxed_rms * problem.length, forces=settings.n_points)
             more_points = _more_points(problem, settings, monitor)
@@ -299,8 +303,12 @@ def _search(
     assert best is not None  # at least one attempt is made
     last = before_rounding[-1]
     if enough and attempt not in finishes:
-        finishes[attempt] = _finished(mesh, profile, element, last, settings, trace)
-    return _Searched(best, last, settings, attempt + 1, least, finishes.get(attempt, _Finish()), more_points)
+        finish = _judged(_finished(mesh, profile, element, last, settings, trace), mesh, profile, settings)
+        finishes[attempt] = finish
+    finish = finishes.get(attempt, _Finish())
+    if _prints_better(problem, mesh, profile, settings, best, finish):
+        finish = replace(finish, found=None)
+    return _Searched(best, last, settings, attempt + 1, least, finish, more_points)
 
 
 def _printed_rms(
@@ -323,6 +331,41 @@ def _printed_rms(
         return printed.rms
     rms = refitted_in(problem_of(mesh, profile["materials"], element), found, printed.design, weights)
     return rms if rms > FLIPS_WIN_BACK * tolerance else printed.rms
+
+
+def _judged(
+    finish: _Finish, mesh: Mapping[str, np.ndarray], profile: Mapping[str, Any], settings: ReducedSettings
+) -> _Finish:
+    """The same with its error as printed, without flips, which take minutes in the elements of the last fit."""
+    found, weights = finish.found, settings.weights
+    if found is None:
+        return finish
+    rms = _rms(found)
+    if rms > CERTAINLY_ENOUGH * weights.error_scale:
+        rms = as_printed(
+            found.equilibria.problem, mesh, profile["printer"], profile["goal"], weights, found, good_enough=np.inf
+        ).rms
+    return replace(finish, printed_rms=rms)
+
+
+def _prints_better(
+    problem: Problem,
+    mesh: Mapping[str, np.ndarray],
+    profile: Mapping[str, Any],
+    settings: ReducedSettings,
+    best: Search,
+    finish: _Finish,
+) -> bool:
+    """Whether the design `best`, rounded in linear elements, errs less as printed than that of `finish`, both in the
+    elements of the latter."""
+    if finish.found is None or finish.printed_rms <= CERTAINLY_ENOUGH * settings.weights.error_scale:
+        return False
+    printer, goal, weights = profile["printer"], profile["goal"], settings.weights
+    printed = as_printed(problem, mesh, printer, goal, weights, best, weights.error_scale)
+    if printed.design is None:
+        return False
+    rms = refitted_in(finish.found.equilibria.problem, best, printed.design, weights)
+    return rms < finish.printed_rms
 
 
 def _rms(found: Search) -> float:

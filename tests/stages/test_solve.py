@@ -10,12 +10,14 @@ from bent_bar import PROFILE, bent_bar
 from shapes.boxes import box
 
 from fab4d.design.objective import shape_error
+from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, at_rest
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
 from fab4d.stages import _bring_up, _coarse, solve
 from fab4d.stages._design import problem_of
 from fab4d.stages._figures import limits_of
+from fab4d.stages._printed import Printed
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run, search_settings
 
@@ -141,6 +143,7 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
 
     monkeypatch.setattr(solve, "rounded_from", all_smp)
     monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(solve, "_prints_better", lambda *_: False)
     for most, kept in ((None, True), (0.9, False)):
         found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=QUADRATIC)["relaxed"]
         assert (len(found["x"]) > len(bar["X"])) == kept
@@ -170,6 +173,31 @@ def test_linear_elements_round_what_quadratic_ones_lose(
     assert len(found["relaxed"]["x"]) == len(bar["X"])
     assert solve.NOT_LINEAR not in found["solve_report"]["left_out"]
     assert found["solve_report"]["printed_rms_mm"] <= 1.5
+
+
+@pytest.mark.parametrize(
+    ("quadratic_rms", "linear_rms", "tried", "delivered"),
+    [(0.9, 0.1, False, "quadratic"), (1.2, 1.1, True, "linear"), (1.2, 1.3, True, "quadratic")],
+)
+def test_the_design_that_prints_better_is_delivered(
+    monkeypatch: pytest.MonkeyPatch, quadratic_rms: float, linear_rms: float, tried: bool, delivered: str
+) -> None:
+    """Errors as printed in shares of the tolerance; linear elements are tried where quadratic ones miss it."""
+    bar, goal = bent_bar((9, 2, 2), 50.0), Goal(tolerance=1.5, max_forces=3)
+    tolerance = goal.tolerance / float(np.linalg.norm(np.ptp(bar["X"], axis=0)))
+    as_printed = solve.as_printed
+
+    def printed(problem: Problem, *given: Any, **named: Any) -> Printed:
+        found = as_printed(problem, *given, **named)
+        return found if problem.body.order == 1 else replace(found, rms=quadratic_rms * tolerance)
+
+    monkeypatch.setattr(solve, "as_printed", printed)
+    monkeypatch.setattr(solve, "refitted_in", lambda *_: linear_rms * tolerance)
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(solve, "CERTAINLY_ENOUGH", 0.0)
+    found = solved(bar, goal, solver=QUADRATIC)
+    assert (solve.NOT_LINEAR not in found["solve_report"]["left_out"]) == tried
+    assert (len(found["relaxed"]["x"]) > len(bar["X"])) == (delivered == "quadratic")
 
 
 def test_quadratic_elements_do_not_round_what_they_see_as_linear_ones_do(
