@@ -21,7 +21,6 @@ from fab4d.design.reduced import (
     decided_by_and_by,
     undecided_fraction,
 )
-from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import FloatArray
 
 # So many steps in a row end the rounding that are not taken, or only with the largest damping and leave more than this
@@ -88,10 +87,11 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
         if settings.decide_in_steps and not tried and hard >= HARD_STEPS and left <= FEW_LEFT:
-            early, tried = _decided_early(at, settings), True
-            if early is not None:
-                watch(before.phase.value, early)
-                return early
+            design, tried = decided_by_and_by(at, settings), True
+            if design is not None:
+                at = replace(at, design=design, phase=Phase.DONE)
+                watch(before.phase.value, at)
+                return at
         if held_back == MOST_HELD_BACK:
             break
     return decided(at, settings, LAST_SHARE)
@@ -100,12 +100,3 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
 def _is_hard(after: Search) -> bool:
     """Whether a step was not taken, or only with the largest damping."""
     return not after.accepted or after.damping >= LARGEST_DAMPING
-
-
-def _decided_early(at: Search, settings: ReducedSettings) -> Search | None:
-    """The state with the rest decided by and by; None where no equilibria lead there."""
-    try:
-        design = decided_by_and_by(at, settings)
-    except EquilibriumError:
-        return None
-    return None if design is None else replace(at, design=design, phase=Phase.DONE)

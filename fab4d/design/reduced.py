@@ -362,18 +362,18 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
     """
     equilibria, design, damping = at.equilibria, at.design, at.damping
     weights, L = _rounding_weights(at, settings).replace(lam_round=0.0), smoothness_matrix(equilibria.problem)
-    while (left := np.flatnonzero(_undecided(design.rho))).size:
-        count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED)
-        sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
-        rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
-        rho[sure], movable[unsure] = np.round(rho[sure]), True
-        try:
+    try:
+        while (left := np.flatnonzero(_undecided(design.rho))).size:
+            count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED)
+            sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
+            rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
+            rho[sure], movable[unsure] = np.round(rho[sure]), True
             design = change_density(equilibria, design, rho)
-        except EquilibriumError:
-            return None
-        step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
-        design, damping = step.design, min(step.damping, LARGEST_DAMPING)
-    return change_density(equilibria, design, np.round(design.rho))
+            step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
+            design, damping = step.design, min(step.damping, LARGEST_DAMPING)
+        return change_density(equilibria, design, np.round(design.rho))
+    except EquilibriumError:
+        return None
 
 
 # -- refit

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.finish import carried_in, rounded_from
+from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, Watch, at_rest, fewest_points, relaxed, solve_reduced
@@ -182,6 +183,18 @@ class _Finish:
 
 
 @dataclass(frozen=True, eq=False)
+class _Linear:
+    """A design rounded in linear elements as printed: its state, None without an equilibrium, and its RMS error, L0.
+
+    in_fit : that in the elements of the last fit; None where it is not known
+    """
+
+    design: Design | None
+    rms: float
+    in_fit: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class _Searched:
     """What the attempts came to.
 
@@ -266,6 +279,7 @@ def _search(
     """
     first, start = _resumed(problem, trace, monitor)
     best, least = _restored_best(problem, monitor)
+    printed: _Linear | None = None
     before_rounding = [] if start is None else _restored_relaxed(problem, monitor)
     count, finishes = _points(problem, profile, trace, monitor), dict[int, _Finish]()
     enough = profile["goal"].smp == "enough"
@@ -294,10 +308,10 @@ def _search(
             best = best or found
             break
         start = None
-        rms = _printed_rms(problem, mesh, profile, element, settings, found)
-        if best is None or rms < least:
-            best, least = found, rms
-            monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(rms)})
+        linear = _linear_printed(problem, mesh, profile, element, settings, found)
+        if best is None or linear.rms < least:
+            best, least, printed = found, linear.rms, linear
+            monitor.save(BEST, _checkpoint(attempt, found, trace) | {"rms": np.array(least)})
         if least <= settings.weights.error_scale:
             break
     assert best is not None  # at least one attempt is made
@@ -306,31 +320,33 @@ def _search(
         finish = _judged(_finished(mesh, profile, element, last, settings, trace), mesh, profile, settings)
         finishes[attempt] = finish
     finish = finishes.get(attempt, _Finish())
-    if _prints_better(problem, mesh, profile, settings, best, finish):
-        finish = replace(finish, found=None)
+    if finish.found is not None and finish.printed_rms > CERTAINLY_ENOUGH * settings.weights.error_scale:
+        printed = printed or _linear_printed(problem, mesh, profile, element, settings, best)
+        if _prints_better(best, printed, finish.found.equilibria.problem, finish.printed_rms, settings):
+            finish = _Finish(left_out=finish.left_out)
     return _Searched(best, last, settings, attempt + 1, least, finish, more_points)
 
 
-def _printed_rms(
+def _linear_printed(
     problem: Problem,
     mesh: Mapping[str, np.ndarray],
     profile: Mapping[str, Any],
     element: str,
     settings: ReducedSettings,
     found: Search,
-) -> float:
-    """RMS error, L0, of a rounded design as printed.
+) -> _Linear:
+    """A rounded design as printed.
 
-    In the elements of the last fit where these err by more than flips win back: linear ones lock in thin limbs, and
-    tell nothing about labels that hold a limb by single tets.
+    Its error is that in the elements of the last fit where these err by more than flips win back: linear ones lock in
+    thin limbs, and tell nothing about labels that hold a limb by single tets.
     """
     weights = settings.weights
     tolerance = weights.error_scale
     printed = as_printed(problem, mesh, profile["printer"], profile["goal"], weights, found, tolerance)
     if element == "linear" or printed.design is None or printed.rms > tolerance:
-        return printed.rms
+        return _Linear(printed.design, printed.rms)
     rms = refitted_in(problem_of(mesh, profile["materials"], element), found, printed.design, weights)
-    return rms if rms > FLIPS_WIN_BACK * tolerance else printed.rms
+    return _Linear(printed.design, rms if rms > FLIPS_WIN_BACK * tolerance else printed.rms, rms)
 
 
 def _judged(
@@ -348,24 +364,15 @@ def _judged(
     return replace(finish, printed_rms=rms)
 
 
-def _prints_better(
-    problem: Problem,
-    mesh: Mapping[str, np.ndarray],
-    profile: Mapping[str, Any],
-    settings: ReducedSettings,
-    best: Search,
-    finish: _Finish,
-) -> bool:
-    """Whether the design `best`, rounded in linear elements, errs less as printed than that of `finish`, both in the
-    elements of the latter."""
-    if finish.found is None or finish.printed_rms <= CERTAINLY_ENOUGH * settings.weights.error_scale:
-        return False
-    printer, goal, weights = profile["printer"], profile["goal"], settings.weights
-    printed = as_printed(problem, mesh, printer, goal, weights, best, weights.error_scale)
+def _prints_better(best: Search, printed: _Linear, problem: Problem, rms: float, settings: ReducedSettings) -> bool:
+    """Whether the design `best`, rounded in linear elements, errs by less than rms, L0, as printed in those of
+    `problem`."""
     if printed.design is None:
         return False
-    rms = refitted_in(finish.found.equilibria.problem, best, printed.design, weights)
-    return rms < finish.printed_rms
+    in_fit = printed.in_fit
+    if in_fit is None:
+        in_fit = refitted_in(problem, best, printed.design, settings.weights)
+    return in_fit < rms
 
 
 def _rms(found: Search) -> float:

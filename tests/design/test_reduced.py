@@ -1,5 +1,6 @@
 """The reduced solver on scenes whose answer is known, because they were made by simulating a design."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from fab4d.design.reduced import (
     at_rest,
     change_density,
     decided,
+    decided_by_and_by,
     fewest_points,
     first_search,
     largest_traction,
@@ -369,6 +371,24 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
         < 1e-5
     )
     assert rms(problem, by_and_by.design) < rms(problem, at_once.design)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_without_an_equilibrium_nothing_is_decided_by_and_by(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, lost: int
+) -> None:
+    last, calls = searched[-1], itertools.count(1)
+    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)))
+
+    def follow(_: Equilibria, design: Design, rho: np.ndarray) -> Design:
+        if next(calls) == lost:
+            raise EquilibriumError
+        return replace(design, rho=rho)
+
+    monkeypatch.setattr(reduced, "change_density", follow)
+    monkeypatch.setattr(reduced, "gauss_newton_step", lambda *given, **_: gauss_newton.Step(given[3], 0.0, 1.0, True))
+    assert decided_by_and_by(undecided, settings_for(truth.problem)) is None
+    assert next(calls) == lost + 1
 
 
 def test_a_step_to_other_densities_that_failed_is_not_tried_again_soon(

@@ -200,6 +200,25 @@ def test_the_design_that_prints_better_is_delivered(
     assert (len(found["relaxed"]["x"]) > len(bar["X"])) == (delivered == "quadratic")
 
 
+@pytest.mark.parametrize(("in_fit", "asked"), [(None, 1), (0.1, 0), (0.3, 0)])
+def test_an_error_in_the_elements_of_the_fit_is_not_found_twice(
+    bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch, in_fit: float | None, asked: int
+) -> None:
+    problem = problem_of(bar, PROFILE["materials"], "linear")
+    best, calls = at_rest(problem), list[Any]()
+    settings = search_settings(problem, PROFILE | {"goal": Goal(0.6, 3)})
+
+    def refitted(*given: Any) -> float:
+        calls.append(given)
+        return 0.1
+
+    monkeypatch.setattr(solve, "refitted_in", refitted)
+    better = solve._prints_better(best, solve._Linear(best.design, 0.2, in_fit), problem, 0.2, settings)
+    assert better == (in_fit != 0.3)
+    assert len(calls) == asked
+    assert not solve._prints_better(best, solve._Linear(None, np.inf), problem, 0.2, settings)
+
+
 def test_quadratic_elements_do_not_round_what_they_see_as_linear_ones_do(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
