@@ -19,6 +19,7 @@ class Status(Enum):
     NO_STEP = "no step along the Newton direction lowers the residual inside the domain"
     SINGULAR = "the tangent is singular"
     UNSTABLE = "the way leads past unstable states"
+    ROUNDING = "rounding keeps the residual above the tolerance"
 
 
 MAX_HALVINGS = 20
@@ -27,6 +28,8 @@ ASTRAY = 3
 # Steps with an old factor are far cheaper than those with a new one, as long as each leaves this share of the residual
 # at most.
 CHORD_GAIN = 0.3
+# Of a residual below this one, Newton's step leaves far less than this share, if anything but rounding is left of it.
+ROUNDING_LEVEL, ROUNDING_LEFT = 1e-9, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +110,12 @@ def newton(
             t *= 0.5
         else:
             return Solution(z, Status.NO_STEP, at.norm / at.scale, iteration, guarded)
+        rounding = at.norm <= ROUNDING_LEVEL * at.scale and new.norm > max(
+            ROUNDING_LEFT * at.norm, tolerance * new.scale
+        )
         z, at = ahead, new
+        if rounding:
+            return Solution(z, Status.ROUNDING, at.norm / at.scale, iteration + 1, guarded)
     status = Status.CONVERGED if at.norm <= tolerance * at.scale else Status.MAX_ITERATIONS
     return Solution(z, status, at.norm / at.scale, max_iterations, guarded)
 

@@ -121,3 +121,25 @@ def test_factors_are_used_again_between_iterations():
     found = newton(wells, factor, np.full(N, 0.9), 1e-12, 20, no_fallback)
     assert found.converged
     assert factor.count < 4  # Newton's method alone needs 5
+
+
+def test_ends_where_rounding_leaves_nothing_to_gain():
+    """The residual is known to ten decimals: one more factor shows that the next will not lower it."""
+    made = []
+
+    def counted(z: np.ndarray) -> Factor:
+        made.append(z)
+        return tangent(z)
+
+    def rounded(z: np.ndarray) -> Residual:
+        exact = wells(z)
+        return Residual(np.round(exact.r + 0.3e-10, 10) - 0.3e-10, exact.scale, exact.potential)
+
+    enough = newton(rounded, counted, np.full(N, 1.1), 1e-9, 20)
+    needed = len(made)
+    found = newton(rounded, counted, np.full(N, 1.1), 1e-13, 20)
+    assert enough.converged
+    assert found.status is Status.ROUNDING
+    assert found.residual < 1e-9
+    assert np.allclose(found.z, 1.0, atol=1e-9)
+    assert len(made) - needed <= needed + 2
