@@ -40,7 +40,7 @@ def program(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: Floa
     The patches move along the path of `mesh.interpolation`; only their mean positions are taken from it.
     """
     median, steps, loaded = load(equilibria, rho, x, forces)
-    final, more, unloaded = _unload(equilibria, rho, median)
+    final, more, unloaded = unload(equilibria, rho, median)
     return Programming(median, final, steps + more, loaded, unloaded)
 
 
@@ -85,17 +85,28 @@ def load(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatAr
     return _follow(rest, solve, onwards, FIRST_LOAD)
 
 
-def _unload(equilibria: Equilibria, rho: FloatArray, median: Median) -> tuple[Final, int, float]:
-    """Let the TPE pull the cold part back, little by little: under dead loads the free part would turn over."""
+def unload(
+    equilibria: Equilibria,
+    rho: FloatArray,
+    median: Median,
+    path_tolerance: float = PATH_TOLERANCE,
+    tolerance: float = END_TOLERANCE,
+    stay: bool = False,
+) -> tuple[Final, int, float]:
+    """Let the TPE pull the cold part back, little by little: under dead loads the free part would turn over.
+
+    stay : see `newton`
+    Returns the final shape that this ends in, the load steps made, and how far it came.
+    """
 
     def solve(t: float, guess: Final, tolerance: float, iterations: int) -> Final:
-        return equilibria.solve_final(rho, median, guess.y, tolerance, iterations, t)
+        return equilibria.solve_final(rho, median, guess.y, tolerance, iterations, t, stay=stay)
 
     def onwards(before: Final, now: Final, ratio: float, t: float) -> Final:  # noqa: ARG001
         return replace(now, y=equilibria.free_turning.repeat(before.y, now.y, now.y, ratio))
 
     held = equilibria.solve_final(rho, median, median.x, unloaded=0.0)
-    return _follow(held, solve, onwards, FIRST_UNLOAD)
+    return _follow(held, solve, onwards, FIRST_UNLOAD, path_tolerance, tolerance)
 
 
 Shape = TypeVar("Shape", Median, Final)
@@ -106,6 +117,8 @@ def _follow(
     solve: Callable[[float, Shape, float, int], Shape],
     onwards: Callable[[Shape, Shape, float, float], Shape],
     step: float,
+    path_tolerance: float = PATH_TOLERANCE,
+    end_tolerance: float = END_TOLERANCE,
 ) -> tuple[Shape, int, float]:
     """The path of equilibria from `start` at t = 0 as far as it goes; returns its end, the steps made and t there.
 
@@ -116,13 +129,13 @@ def _follow(
     while done < 1.0 and step >= SMALLEST_STEP:
         aim = 1.0 if step >= 1.0 - done else done + (1.0 - done) / np.ceil((1.0 - done) / step)
         guess = onwards(before, now, (aim - done) / (done - last), aim) if steps else now
-        trial = solve(aim, guess, PATH_TOLERANCE, PATH_ITERATIONS)
+        trial = solve(aim, guess, path_tolerance, PATH_ITERATIONS)
         if trial.solution.converged:
             step = (aim - done) * min(max(USUAL_ITERATIONS / max(trial.solution.iterations, 1), 0.5), 2.0)
             before, now, last, done, steps = now, trial, done, aim, steps + 1
         else:
             step = (aim - done) / 2
-    return solve(done, now, END_TOLERANCE, END_ITERATIONS), steps, done
+    return solve(done, now, end_tolerance, END_ITERATIONS), steps, done
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array, vstack
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Final, Median, Pinned
+from fab4d.design.forward import unload
 from fab4d.design.objective import (
     DensityTerms,
     ObjectiveWeights,
@@ -25,6 +26,8 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # Relative residual at which an iterate counts as in equilibrium; the delivered state is solved to rounding.
 SEARCH_TOLERANCE = 1e-6
+# So do the states on the way of unloading, from which the next is guessed only.
+UNLOADING_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +50,14 @@ def equilibrate(
     max_iterations: int = 12,
     stay: bool = False,
     near: Linearisation | None = None,
+    by_unloading: bool = False,
 ) -> Design | None:
     """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found.
 
     Where the median shape is found moves from its guess, the guess of the final shape moves along: what stiff SMP has
     frozen would else be bent in it. near : about a design near this one
+    by_unloading : whether a final shape that is not found from its guess is looked for where unloading ends, which
+        costs three times as much and leads to labels whose final shape lies far from those before
     """
     hot, cold = (None, None) if near is None else (near.held, Pinned(near.free, near.free_fixed))
     median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay, near=hot)
@@ -60,6 +66,9 @@ def equilibrate(
     turning = equilibria.free_turning
     y = _ahead(turning.step, y, median.x - x, lambda y: equilibria.final_gradient(rho, median, y)[1])
     final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay, near=cold)
+    if by_unloading and not final.solution.converged:
+        final, _, unloaded = unload(equilibria, rho, median, UNLOADING_TOLERANCE, tolerance, stay)
+        return Design(rho, median, final) if unloaded == 1.0 and final.solution.converged else None
     return Design(rho, median, final) if final.solution.converged else None
 
 
@@ -75,6 +84,8 @@ HELD_STEP = 0.05
 # So may the nodes of the median shape in the root mean square: where that is nearly unstable, small changes of density
 # and held positions move it far along a soft mode, and its linear prediction is of no use there.
 MEDIAN_STEP = 0.02
+# Share of the largest entry of a Hessian that is rounding.
+ROUNDED_OFF = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +118,9 @@ class Model:
         """The model with Levenberg-Marquardt terms that hold back density and held positions alike."""
         k = len(self.H_cc)
         moves = 6 * damping / (len(self.dx_dc) * MEDIAN_STEP**2)
-        held = self.H_cc + 2 * (damping + 1e-9) / (max(k, 1) * HELD_STEP**2) * np.eye(k) + moves * self.moved_cc
+        # Rounding of a singular H_cc must not leave it indefinite, however strict the tolerance.
+        least = 2 * (damping + 1e-9) / (max(k, 1) * HELD_STEP**2) + ROUNDED_OFF * np.abs(self.H_cc).max(initial=0.0)
+        held = self.H_cc + least * np.eye(k) + moves * self.moved_cc
         return DampedModel(self, damping * volume_fractions, moves, cho_factor(held) if k else None)
 
 

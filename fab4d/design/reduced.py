@@ -402,7 +402,7 @@ def change_density(
         mixed = start + aim * (rho - start)
         moved = held if moves is None else held + aim * moves.reshape(-1, 3)
         x, forces, y = design.median.x, design.median.forces, design.final.y
-        trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay)
+        trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay, by_unloading=True)
         if trial is not None:
             design, done, led_on = trial, aim, led_on + 1
             if 2 * step < failed or led_on == BEFORE_LONGER:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from bars import bar, held_design, two_patches
 
-from fab4d.design.equilibria import Equilibria, Median
+from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.forward import balance, program
-from fab4d.design.gauss_newton import Design
+from fab4d.design.gauss_newton import Design, equilibrate, held_positions
 from fab4d.design.problem import Problem
+from fab4d.design.reduced import change_density
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.solvers.newton import Status
 
@@ -105,6 +106,50 @@ class Ending(Equilibria):
         if np.linalg.norm(median.forces[0]) <= self.largest:
             return median
         return replace(median, solution=replace(median.solution, status=Status.NO_STEP))
+
+
+class Near(Equilibria):
+    """Equilibria whose final shapes are found from a guess near them alone."""
+
+    def solve_final(self, rho: np.ndarray, median: Median, y: np.ndarray, *args: Any, **options: Any) -> Final:
+        final = super().solve_final(rho, median, y, *args, **options)
+        R, t = best_rigid_motion(y, final.y)
+        if np.abs(y @ R.T + t - final.y).max() < 0.02:
+            return final
+        return replace(final, solution=replace(final.solution, status=Status.UNSTABLE))
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+def test_a_final_shape_far_from_its_guess_is_found_by_unloading(element: str) -> None:
+    """The other half becomes SMP; the bar, bent before, lies straight in the guess."""
+    equilibria, design = designed(60, element)
+    rho, near = 1 - design.rho, Near(equilibria.problem, equilibria.patches)
+    x, f, held = design.median.x, design.median.forces, held_positions(equilibria, design.median)
+    guess = equilibria.problem.body.X
+    assert equilibrate(near, rho, held, x, f, guess) is None
+    found = equilibrate(near, rho, held, x, f, guess, by_unloading=True)
+    assert found is not None
+    np.testing.assert_array_equal(found.rho, rho)
+    assert balance(equilibria, rho, found.median, found.final).final < 1e-6
+    followed = change_density(near, replace(design, final=replace(design.final, y=guess)), rho, 1.0)
+    R, t = best_rigid_motion(followed.final.y, found.final.y)
+    np.testing.assert_allclose(followed.final.y @ R.T + t, found.final.y, atol=1e-5)
+
+
+def test_a_final_shape_that_unloading_does_not_come_to_is_none() -> None:
+    equilibria, design = designed(60)
+    held, none = held_positions(equilibria, design.median), Never(equilibria.problem, equilibria.patches)
+    x, f, y = design.median.x, design.median.forces, design.final.y
+    assert equilibrate(none, design.rho, held, x, f, y, by_unloading=True) is None
+
+
+class Never(Equilibria):
+    """Equilibria whose final shapes are found only while most of the TPE is taken as stress-free."""
+
+    def solve_final(self, *args: Any, **options: Any) -> Final:
+        final = super().solve_final(*args, **options)
+        unloaded = args[5] if len(args) > 5 else options.get("unloaded", 1.0)
+        return final if unloaded < 0.5 else replace(final, solution=replace(final.solution, status=Status.UNSTABLE))
 
 
 def test_loading_that_cannot_go_on_tells_how_far_it_came() -> None:
