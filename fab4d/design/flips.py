@@ -6,7 +6,7 @@ of the labels that result from it, and one that comes to nothing teaches what it
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,8 +34,9 @@ LEAST_ROUND_GAIN = 2e-2
 STEPS, FEW_STEPS = 2000, 300
 # Of more tets than this, in proportion more are candidates, each for a smaller gain.
 USUAL_TETS = 5_000
-# So many rounds in a row that gain less end it.
-MOST_POOR = 3
+# So many rounds in a row that gain less end it. Once the tolerance is met, a round is also poor after which the target
+# is more than MOST_TO_GO such rounds away, and fewer end it.
+MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 4
 # Flips whose equilibria are farther away than steps of this share of the change go are given up.
 SMALLEST_STEP = 0.25
 # Steps of the held positions after each round; once all are made, they are fitted to the end.
@@ -52,15 +53,23 @@ class FlipSettings:
     annealed : labels of less energy that pinch no more than the given ones, or less
 
     target_rms : RMS error, L0, at which nothing more is to be won        max_smp_fraction : of the volume
+    tolerance : RMS error, L0, that is accepted
     low_rms : RMS error, L0, that is low already, so that the first round that gains little ends it
     """
 
     printable: Printable
     annealed: Annealed
     target_rms: float
+    tolerance: float = 0.0
     low_rms: float = 0.0
     max_smp_fraction: float = 1.0
     rounds: int = 15
+
+    def most_poor(self, rms: float) -> int:
+        """So many poor rounds in a row end the flips at this RMS error, L0."""
+        if rms <= self.low_rms:
+            return 1
+        return POOR_AFTER if rms <= self.tolerance else MOST_POOR
 
 
 def polish_labels(
@@ -79,7 +88,7 @@ def polish_labels(
     found: Influence | None = None
     for seed in range(settings.rounds):
         rms = shape_error(problem, design.final.y).rms
-        if rms <= settings.target_rms or poor >= (1 if rms <= settings.low_rms else MOST_POOR):
+        if rms <= settings.target_rms or poor >= settings.most_poor(rms):
             break
         smp = design.rho > 0.5
         if found is None:
@@ -98,8 +107,9 @@ def polish_labels(
             price, poor = DEARER * price, poor + 1
             continue
         fitted = refit(equilibria, trial, plain, lambda at: None, iterations=FOLLOWING_STEPS)  # noqa: ARG005
-        new = evaluate(equilibria, plain, L, fitted)
-        poor = poor + 1 if new > (1 - LEAST_ROUND_GAIN) * value else 0
+        new, new_rms = evaluate(equilibria, plain, L, fitted), shape_error(problem, fitted.final.y).rms
+        far = rms <= settings.tolerance and _rounds_to_go(rms, new_rms, settings.target_rms) > MOST_TO_GO
+        poor = poor + 1 if far or new > (1 - LEAST_ROUND_GAIN) * value else 0
         if new < value:
             design, value, found = fitted, new, None
             price /= CHEAPER
@@ -110,6 +120,13 @@ def polish_labels(
             limits = view.limits.at(trial.median) - settled.moves @ view.limits_by_held
             found, price = found.taught(changed, shape, limits), DEARER * price
     return refit(equilibria, design, weights, watch) if design is not start else start
+
+
+def _rounds_to_go(before: float, after: float, target: float) -> float:
+    """How many rounds that lower the error by the same share as the last lead from `after` to `target`."""
+    if after <= target:
+        return 0.0
+    return float(np.log(after / target) / np.log(before / after)) if after < before else np.inf
 
 
 def mended(
@@ -124,7 +141,8 @@ def mended(
     tets = np.flatnonzero(near_interface(problem, smp))
     if not equilibria.patches.count or not tets.size:
         return design
-    found = influence(equilibria, design, tets, weights)
+    # A place cannot be left as it is because flips are in doubt.
+    found = replace(influence(equilibria, design, tets, weights), doubt=0.0)
     price = SURE_PRICE / fineness(problem)
     labels = flip(problem, found, smp, smp, settings, price, STEPS, defect_price=DEFECT_PRICE)
     if (labels == smp).all():

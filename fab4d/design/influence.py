@@ -3,7 +3,7 @@
 The forces that flipped tets exert (`flip_loads.py`) go through the factors of the whole part.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
 
@@ -41,6 +41,9 @@ NEAR_LIMIT, MOST_LIMITS, FEW_LIMITS = 0.75, 300, 40
 MOST_ACTIVE_SETS = 10
 # How little a flip's worth follows what is seen of many.
 TEACH_RIDGE = 0.1
+# What a flip does comes out with an error of this share of it, so that flips that each do much and in sum should cancel
+# leave more than they promise.
+UNCERTAIN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +122,7 @@ class View:
 class Settled:
     """Moves (3K,) of the held positions that lower the objective of a predicted design most, and what is left.
 
-    squared : the error in L0, squared, and that of the limits that it is beyond
+    squared : the error in L0, squared, with what is expected of doubt, and that of the limits that it is beyond
     """
 
     squared: float
@@ -128,9 +131,11 @@ class Settled:
 
 @dataclass(frozen=True, eq=False)
 class FlipEnergy:
-    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + prices, of flips of tets (k,).
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + doubts + prices, of flips of
+    tets (k,).
 
     error (p,), changes (k, p) : of the shape        beyond (l,), limit_changes (k, l) : of the limits
+    doubts (k,) : the squared error, L0^2, that is expected of a flip because its change comes out otherwise
     price, defect_price : of each flip, and of each place that is left pinched, L0^2
     """
 
@@ -139,6 +144,7 @@ class FlipEnergy:
     changes: FloatArray
     beyond: FloatArray
     limit_changes: FloatArray
+    doubts: FloatArray
     price: float
     defect_price: float
 
@@ -149,6 +155,7 @@ class Influence:
 
     tets (k,) : that may be flipped        shape (p,), beyond (l,) : measures of the design
     shape_change (k, p), limit_change (k, l) : by each flip at fixed held positions
+    doubt : the share of each change by which it is expected to come out otherwise
     """
 
     tets: IntArray
@@ -157,11 +164,17 @@ class Influence:
     shape_change: FloatArray
     limit_change: FloatArray
     view: View
+    doubt: float = UNCERTAIN
 
     @cached_property
     def change(self) -> FloatArray:
         """(k, p) of the shape by each flip, without what the held positions take away."""
         return self.view.without_held(self.shape_change)
+
+    @cached_property
+    def doubts(self) -> FloatArray:
+        """(k,) squared error, L0^2, that is expected of each flip because its change comes out otherwise."""
+        return (self.doubt**2 * (self.change**2).sum(axis=1)).astype(np.float64)
 
     @cached_property
     def residual(self) -> FloatArray:
@@ -176,7 +189,8 @@ class Influence:
     def after(self, flipped: BoolArray) -> Settled:
         """The held positions settled with the tets `flipped` (k,)."""
         shape, beyond = self.measures(flipped)
-        return self.settled(float(shape @ shape), self.view.shape_by_held @ shape, beyond)
+        squared = float(shape @ shape + self.doubts[flipped].sum())
+        return self.settled(squared, self.view.shape_by_held @ shape, beyond)
 
     def left(self, flipped: BoolArray) -> float:
         """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
@@ -211,8 +225,8 @@ class Influence:
         limit_changes = self.limit_change - self.shape_change @ view.shape_by_held.T @ followed
         error = view.without_held(shape)
         squared = float(error @ error + (np.maximum(beyond, 0) ** 2).sum())
-        prices = price * squared, defect_price * squared
-        return FlipEnergy(self.tets, error, sign * self.change, beyond, sign * limit_changes, *prices)
+        changes = sign * self.change, beyond, sign * limit_changes, sign[:, 0] * self.doubts
+        return FlipEnergy(self.tets, error, *changes, price * squared, defect_price * squared)
 
     def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.
@@ -228,7 +242,7 @@ class Influence:
         limits = _shared(worth[:, None] * self.limit_change[flipped], beyond - self.beyond)
         shape_change, limit_change = self.shape_change.copy(), self.limit_change.copy()
         shape_change[flipped], limit_change[flipped] = shapes, limits
-        return Influence(self.tets, self.shape, self.beyond, shape_change, limit_change, self.view)
+        return replace(self, shape_change=shape_change, limit_change=limit_change)
 
 
 def _shared(changes: FloatArray, total: FloatArray) -> FloatArray:

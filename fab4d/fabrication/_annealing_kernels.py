@@ -108,7 +108,7 @@ def anneal(
 ) -> BoolArray:
     """Which candidates (k,) to flip; `smp` (m,) and `squares` are changed on the way.
 
-    prices : of each flip and of each defect        room : volume that may become SMP
+    prices : of each candidate (k,) and of each defect        room : volume that may become SMP
     temperatures : first and last
     """
     nowhere = np.zeros(len(links.n_nodes), np.bool_)
@@ -116,7 +116,7 @@ def anneal(
     flipped = np.zeros(len(candidates.tets), np.bool_)
     best = flipped.copy()
     energy = least = 0.0
-    (price, defect_price), (first, last) = prices, temperatures
+    (price_of, defect_price), (first, last) = prices, temperatures
     temperature = first
     for step in range(steps):
         if step % SAME_TEMPERATURE == 0:
@@ -127,7 +127,7 @@ def anneal(
             before += defects[vertex]
         # At best the flip removes all defects at its corners.
         allowed = before * defect_price - temperature * np.log(1.0 - random.random())
-        rise = _rise(k, sign, squares) + sign * price
+        rise = _rise(k, sign, squares) + sign * price_of[k]
         if rise > allowed or not _at_interface(k, smp, candidates) or (not smp[tet] and candidates.volumes[k] > room):
             continue
         if len(squares.beyond):

@@ -24,9 +24,11 @@ MOST_STEPS = 20_000_000
 
 
 class Energy(Protocol):
-    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + prices, of flips of tets (k,).
+    """|error + sum of changes|^2 + |positive part of beyond + sum of limit_changes|^2 + doubts + prices, of flips of
+    tets (k,).
 
     error (p,), changes (k, p) : of a shape        beyond (l,), limit_changes (k, l) : of limits that it should keep
+    doubts (k,) : what a flip costs for not being known exactly; less than 0 for one that takes such a cost away
     price, defect_price : of each flip, and of each defect of the boundary that is left
     """
 
@@ -40,6 +42,8 @@ class Energy(Protocol):
     def beyond(self) -> FloatArray: ...
     @property
     def limit_changes(self) -> FloatArray: ...
+    @property
+    def doubts(self) -> FloatArray: ...
     @property
     def price(self) -> float: ...
     @property
@@ -62,8 +66,9 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         candidates = Candidates(energy.tets, neighbours[energy.tets], volumes[energy.tets])
         squares = _squares(energy)
         start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum()) or 1.0
+        prices = energy.price + energy.doubts, energy.defect_price
         flipped = anneal(
-            labels.copy(), candidates, squares, (energy.price, energy.defect_price), room, (HOT * start, COLD * start),
+            labels.copy(), candidates, squares, prices, room, (HOT * start, COLD * start),
             min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed), links, scratch,
         )  # fmt: skip
         result = labels.copy()

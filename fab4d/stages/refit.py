@@ -237,7 +237,7 @@ def _flip_settings(
     relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
     down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
-    settings = replace(settings, low_rms=LOW_ERROR * weights.error_scale)
+    settings = replace(settings, tolerance=weights.error_scale, low_rms=LOW_ERROR * weights.error_scale)
     few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * weights.error_scale
     return replace(settings, rounds=FEW_ROUNDS) if few else settings
 

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -152,6 +153,27 @@ def test_where_the_error_is_low_the_first_poor_round_ends_it() -> None:
         energies.clear()
         polish_labels(equilibria, design, WEIGHTS, replace(stuck, low_rms=low), lambda at: None)  # noqa: ARG005
         assert len(energies) == rounds
+
+
+def test_once_the_tolerance_is_met_flips_end_where_the_target_is_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every round comes true, by a thirtieth of the error at first and by far more later."""
+    problem = bar(degrees=30.0)
+    equilibria, energies = two_patches(problem), list[FlipEnergy]()
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    errors = np.r_[1.0, 0.97, 0.94, 0.4, 0.03]
+    settings = replace(recording(freely(problem), energies), target_rms=0.04)
+
+    def rounds(tolerance: float) -> int:
+        energies.clear()
+        values, shown = iter(errors**2), iter(np.repeat(errors, 2)[1:])
+        monkeypatch.setattr(flips, "evaluate", lambda *_: next(values))
+        monkeypatch.setattr(flips, "shape_error", lambda *_: SimpleNamespace(rms=next(shown)))
+        monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+        polish_labels(equilibria, design, WEIGHTS, replace(settings, tolerance=tolerance), lambda at: None)  # noqa: ARG005
+        return len(energies)
+
+    assert rounds(1.1) == flips.POOR_AFTER
+    assert rounds(0.5) == len(errors) - 1
 
 
 def test_held_positions_move_along_with_flips() -> None:

@@ -238,7 +238,7 @@ def test_held_positions_settle_where_shape_and_limits_together_are_least(
 def energy_of(energy: FlipEnergy, flipped: np.ndarray) -> float:
     error = energy.error + energy.changes[flipped].sum(axis=0)
     beyond = energy.beyond + energy.limit_changes[flipped].sum(axis=0)
-    return float(error @ error + (np.maximum(beyond, 0) ** 2).sum())
+    return float(error @ error + (np.maximum(beyond, 0) ** 2).sum() + energy.doubts[flipped].sum())
 
 
 def test_the_energy_of_flips_is_that_of_their_error_where_held_positions_follow_the_shape(
@@ -253,12 +253,29 @@ def test_the_energy_of_flips_is_that_of_their_error_where_held_positions_follow_
     for share in (0.0, 0.1, 0.5):
         flipped = random.random(len(tets)) < share
         energy = found.energy(flipped, 1e-3)
-        assert energy_of(energy, none) == pytest.approx(energy_of(from_none, flipped))
-        assert energy_of(energy, flipped) == pytest.approx(energy_of(from_none, none))
+        doubt = from_none.doubts[flipped].sum()
+        assert energy_of(energy, none) == pytest.approx(energy_of(from_none, flipped) - doubt)
+        assert energy_of(energy, flipped) == pytest.approx(energy_of(from_none, none) - doubt)
         assert energy.price == pytest.approx(1e-3 * energy_of(energy, none))
         # The damping of the held positions counts in the settled error only.
-        assert energy_of(energy, none) >= 0.95 * found.left(flipped) ** 2
-        assert energy_of(free.energy(flipped, 0.0), none) == pytest.approx(free.left(flipped) ** 2, rel=0.05)
+        assert energy_of(energy, none) + doubt >= 0.95 * found.left(flipped) ** 2
+        assert energy_of(free.energy(flipped, 0.0), none) + doubt == pytest.approx(free.left(flipped) ** 2, rel=0.05)
+
+
+def test_flips_that_should_cancel_leave_more_than_they_promise(state: tuple[Equilibria, Design, np.ndarray]) -> None:
+    """The expected squared error is the mean of those of flips that each come out by a random share otherwise."""
+    equilibria, design, tets = state
+    found = influence(equilibria, design, tets, WEIGHTS)
+    random, flipped = np.random.default_rng(0), np.zeros(len(tets), bool)
+    flipped[::3] = True
+    share = 1 + found.doubt * random.normal(size=(4000, int(flipped.sum())))
+    errors = found.residual + share @ found.change[flipped]
+    certain, view = replace(found, doubt=0.0), found.view
+    followed = certain.after(flipped).squared - float(((found.residual + found.change[flipped].sum(axis=0)) ** 2).sum())
+    assert followed < 0.05 * certain.after(flipped).squared
+    assert found.after(flipped).squared - followed == pytest.approx((errors**2).sum(axis=1).mean(), rel=0.02)
+    assert found.left(flipped) > certain.left(flipped)
+    assert view is certain.view
 
 
 def test_only_those_that_promise_most_are_looked_at(state: tuple[Equilibria, Design, np.ndarray]) -> None:

@@ -25,19 +25,26 @@ class Energy:
     limit_changes: np.ndarray
     price: float
     defect_price: float = 0.0
+    doubt: np.ndarray | float = 0.0
+
+    @property
+    def doubts(self) -> np.ndarray:
+        return self.doubt + np.zeros(len(self.tets))
 
     def of(self, before: np.ndarray, labels: np.ndarray) -> float:
         flipped = (labels != before)[self.tets]
         error = self.error + self.changes[flipped].sum(axis=0)
         beyond = self.beyond + self.limit_changes[flipped].sum(axis=0)
-        return float(error @ error + (np.maximum(beyond, 0) ** 2).sum() + self.price * flipped.sum())
+        return float(error @ error + (np.maximum(beyond, 0) ** 2).sum() + ((self.price + self.doubts) * flipped).sum())
 
 
 def energy_by_chance(tets: np.ndarray, seed: int, measures: int = 5, price: float = 1e-3) -> Energy:
-    """Two limits, of which one is kept to begin with."""
+    """Two limits, of which one is kept to begin with; some flips take doubts away."""
     random = np.random.default_rng(seed)
     changes, limit_changes = 0.05 * random.normal(size=(len(tets), measures)), 0.03 * random.normal(size=(len(tets), 2))
-    return Energy(tets, random.normal(size=measures), changes, np.array([0.05, -0.04]), limit_changes, price)
+    doubts = 1e-3 * random.normal(size=len(tets))
+    limits = np.array([0.05, -0.04])
+    return Energy(tets, random.normal(size=measures), changes, limits, limit_changes, price, doubt=doubts)
 
 
 def case(meshes, seed, n_points=20):
@@ -175,10 +182,13 @@ def test_limits_count_until_they_are_kept(meshes):
 def test_without_an_error_prices_alone_count(meshes):
     tets, volumes, smp = case(meshes, 7)
     energy = replace(energy_by_chance(np.arange(len(tets)), 7), error=np.zeros(5), beyond=np.array([-1.0, -1.0]))
+    energy = replace(energy, doubt=0.0)
     np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 0), smp)
 
 
 def test_nothing_is_flipped_that_costs_more_than_it_brings(meshes):
     tets, volumes, smp = case(meshes, 7)
     energy = energy_by_chance(np.arange(len(tets)), 7, price=1e3)
+    np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 0), smp)
+    energy = replace(energy, price=0.0, doubt=1e3)
     np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 0), smp)
