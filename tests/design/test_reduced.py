@@ -360,7 +360,7 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     """The surest first: each of the others, and the held positions, may still follow."""
     last, problem = searched[-1], truth.problem
     rho = np.round(last.design.rho)
-    rho[::5] = np.abs(rho[::5] - np.linspace(0.2, 0.45, len(rho[::5])))
+    rho[::5] = np.abs(rho[::5] - np.linspace(0.4, 0.49, len(rho[::5])))
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
     at_once, by_and_by = (decided(ended, settings_for(problem, decide_in_steps=steps), 1.0) for steps in (False, True))
     assert at_once is not None
