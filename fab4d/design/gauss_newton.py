@@ -26,7 +26,7 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # Relative residual at which an iterate counts as in equilibrium; the delivered state is solved to rounding.
 SEARCH_TOLERANCE = 1e-6
-# So do the states on the way of unloading, from which the next is guessed only.
+# That of the states on the way of unloading, which only serve to guess the next.
 UNLOADING_TOLERANCE = 1e-2
 
 

@@ -174,7 +174,7 @@ class Influence:
     @cached_property
     def doubts(self) -> FloatArray:
         """(k,) squared error, L0^2, that is expected of each flip because its change comes out otherwise."""
-        return (self.doubt**2 * (self.change**2).sum(axis=1)).astype(np.float64)
+        return self.doubt**2 * np.einsum("kp,kp->k", self.change, self.change)
 
     @cached_property
     def residual(self) -> FloatArray:

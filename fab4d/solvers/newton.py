@@ -110,9 +110,8 @@ def newton(
             t *= 0.5
         else:
             return Solution(z, Status.NO_STEP, at.norm / at.scale, iteration, guarded)
-        rounding = at.norm <= ROUNDING_LEVEL * at.scale and new.norm > max(
-            ROUNDING_LEFT * at.norm, tolerance * new.scale
-        )
+        little = new.norm > max(ROUNDING_LEFT * at.norm, tolerance * new.scale)
+        rounding = little and at.norm <= ROUNDING_LEVEL * at.scale
         z, at = ahead, new
         if rounding:
             return Solution(z, Status.ROUNDING, at.norm / at.scale, iteration + 1, guarded)

@@ -285,6 +285,7 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
     def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001
         targets.append(settings.target_rms * equilibria.problem.length)
         assert settings.low_rms == pytest.approx(0.15 * weights.error_scale)
+        assert settings.tolerance == weights.error_scale
         return design
 
     monkeypatch.setattr(refit, "polish_labels", spy)
