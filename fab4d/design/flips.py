@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.gauss_newton import Design, evaluate
+from fab4d.design.gauss_newton import Ahead, Design, evaluate
 from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, Watch, change_density, refit
 from fab4d.errors import EquilibriumError
-from fab4d.mesh.tetmesh import BoolArray, FloatArray
+from fab4d.mesh.tetmesh import BoolArray
 
 # So many tets near the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 1500
@@ -102,7 +102,7 @@ def polish_labels(
         if settled.squared >= (1 - LEAST_ROUND_GAIN) * found.after(np.zeros_like(changed)).squared:
             price, poor = price / DEARER, poor + 1
             continue
-        trial = _changed(equilibria, design, flipped, settled.moves)
+        trial = _changed(equilibria, design, flipped, found.ahead(changed))
         if trial is None:
             price, poor = DEARER * price, poor + 1
             continue
@@ -129,26 +129,15 @@ def _rounds_to_go(before: float, after: float, target: float) -> float:
     return float(np.log(after / target) / np.log(before / after)) if after < before else np.inf
 
 
-def mended(
-    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, settings: FlipSettings, steps: int
-) -> Design:
-    """The 0/1 design with places where its boundary is pinched mended by the flips that together cost least.
+def mended(problem: Problem, found: Influence, before: BoolArray, settings: FlipSettings) -> BoolArray:
+    """Printable labels near `before` (m,), what is pinched of them mended by the flips that together cost least.
 
-    Flips that only lower the error are made with them. steps : of the held positions after it
-    It is left as it is where nothing can be mended, and where the labels have no stable equilibrium near.
+    found : what flips of `before` do. Flips that only lower the error are made with them.
     """
-    problem, smp = equilibria.problem, design.rho > 0.5
-    tets = np.flatnonzero(near_interface(problem, smp))
-    if not equilibria.patches.count or not tets.size:
-        return design
     # A place cannot be left as it is because flips are in doubt.
-    found = replace(influence(equilibria, design, tets, weights), doubt=0.0)
+    sure = replace(found, doubt=0.0)
     price = SURE_PRICE / fineness(problem)
-    labels = flip(problem, found, smp, smp, settings, price, STEPS, defect_price=DEFECT_PRICE)
-    if (labels == smp).all():
-        return design
-    changed = _changed(equilibria, design, labels, held_moves(found, smp, labels))
-    return design if changed is None else refit(equilibria, changed, weights, lambda at: None, steps)  # noqa: ARG005
+    return settings.printable(flip(problem, sure, before, before, settings, price, STEPS, defect_price=DEFECT_PRICE))
 
 
 def compensated(
@@ -173,15 +162,15 @@ def fineness(problem: Problem) -> float:
     return max(problem.n_tets / USUAL_TETS, 1.0)
 
 
-def held_moves(found: Influence, before: BoolArray, smp: BoolArray) -> FloatArray:
-    """(3K,) moves of the held positions, L0, that go best with the labels smp (m,) instead of `before` (m,)."""
-    return found.after((smp != before)[found.tets]).moves
+def predicted(found: Influence, before: BoolArray, smp: BoolArray) -> Ahead:
+    """Where the labels smp (m,) instead of `before` (m,) lead, with the held positions that go best with them."""
+    return found.ahead((smp != before)[found.tets])
 
 
-def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, moves: FloatArray) -> Design | None:
+def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, ahead: Ahead) -> Design | None:
     """The design with these labels (m,), its held positions moved; None where it has no stable equilibrium near."""
     try:
-        return change_density(equilibria, design, labels.astype(np.float64), SMALLEST_STEP, stay=True, moves=moves)
+        return change_density(equilibria, design, labels.astype(np.float64), SMALLEST_STEP, stay=True, ahead=ahead)
     except EquilibriumError:
         return None
 

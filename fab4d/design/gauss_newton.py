@@ -39,6 +39,21 @@ class Design:
     final: Final
 
 
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """Where linear algebra has the equilibria after a change: moves (K, 3) of the held positions, and what they and the
+    change of the density do to x (N, 3), f (K, 3) and y (N, 3)."""
+
+    moves: FloatArray
+    x: FloatArray
+    f: FloatArray
+    y: FloatArray
+
+    def part(self, share: float) -> "Ahead":
+        """That of a share of the change."""
+        return Ahead(share * self.moves, share * self.x, share * self.f, share * self.y)
+
+
 def equilibrate(
     equilibria: Equilibria,
     rho: FloatArray,
@@ -77,6 +92,9 @@ TRIAL_ITERATIONS = 8
 ASTRAY_ITERATIONS = 20
 # The equilibria of a step are sought from where it is predicted to lead, or from the first of these shares of the way.
 SHARES_OF_CHANGE = (1.0, 0.5, 0.25, 0.125)
+# Damping falls by the first factor after a step that was taken at once, and rises by the second after one that was not:
+# a step that fails costs more than one that is held back a little.
+SOFTER, STIFFER = 3.0, 5.0
 # A step that is predicted to move a node farther than this, in L0, is not tried.
 LARGEST_MOVE = 0.1
 # A held position may move this far, in L0, at the cost of a density that changes by 1 everywhere.
@@ -274,8 +292,8 @@ def gauss_newton_step(
         if trial is not None:
             new = evaluate(equilibria, weights, L, trial)
             if new < value:
-                return Step(trial, new, damping / 3 if attempt == 0 else damping, True)
-        damping *= 5
+                return Step(trial, new, damping / SOFTER if attempt == 0 else damping, True)
+        damping *= STIFFER
     return Step(design, value, damping, False)
 
 
@@ -314,13 +332,20 @@ def _trial(
     dx, df, dy = model.lin.forward(drho, dc)
     if max(np.abs(dx).max(), np.abs(dy).max()) > LARGEST_MOVE:
         return None
-    median, y = design.median, design.final.y
-    rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, median) + dc
-    x0 = _ahead(equilibria.held_turning.step, median.x, dx, lambda x: equilibria.median_gradient(rho, x)[1])
-    y0 = _ahead(equilibria.free_turning.step, y, dy, lambda y: equilibria.final_gradient(rho, median, y)[1])
+    rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, design.median) + dc
+    guess = guessed(equilibria, design, rho, Ahead(dc, dx, df, dy))
     most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
-    forces = median.forces + df
-    return equilibrate(equilibria, rho, held, x0, forces, y0, max_iterations=most, stay=stay, near=model.lin)
+    return equilibrate(equilibria, rho, held, *guess, max_iterations=most, stay=stay, near=model.lin)
+
+
+def guessed(
+    equilibria: Equilibria, design: Design, rho: FloatArray, ahead: Ahead
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Guesses of x, forces and y of the density rho (m,) near a design."""
+    median, y = design.median, design.final.y
+    x0 = _ahead(equilibria.held_turning.step, median.x, ahead.x, lambda x: equilibria.median_gradient(rho, x)[1])
+    y0 = _ahead(equilibria.free_turning.step, y, ahead.y, lambda y: equilibria.final_gradient(rho, median, y)[1])
+    return x0, median.forces + ahead.f, y0
 
 
 def _ahead(

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array, vstack
 
 from fab4d.design.equilibria import Equilibria, Median
 from fab4d.design.flip_loads import FlipLoads, flip_loads
-from fab4d.design.gauss_newton import HELD_STEP, Design
+from fab4d.design.gauss_newton import HELD_STEP, Ahead, Design
 from fab4d.design.objective import (
     ObjectiveWeights,
     forces_beyond,
@@ -155,6 +155,7 @@ class Influence:
 
     tets (k,) : that may be flipped        shape (p,), beyond (l,) : measures of the design
     shape_change (k, p), limit_change (k, l) : by each flip at fixed held positions
+    lin, loads : the linear maps about the design, and what the flips exert
     doubt : the share of each change by which it is expected to come out otherwise
     """
 
@@ -164,6 +165,8 @@ class Influence:
     shape_change: FloatArray
     limit_change: FloatArray
     view: View
+    lin: Linearisation
+    loads: FlipLoads
     doubt: float = UNCERTAIN
 
     @cached_property
@@ -191,6 +194,15 @@ class Influence:
         shape, beyond = self.measures(flipped)
         squared = float(shape @ shape + self.doubts[flipped].sum())
         return self.settled(squared, self.view.shape_by_held @ shape, beyond)
+
+    def ahead(self, flipped: BoolArray) -> Ahead:
+        """Where the equilibria are predicted with the tets `flipped` (k,) and the held positions settled."""
+        moves, loads, lin = self.after(flipped).moves, self.loads.of(np.flatnonzero(flipped)), self.lin
+        n = loads.hot.shape[0]
+        hot = -np.concatenate([loads.hot.sum(axis=1), moves])
+        z, dy = lin.respond(hot[:, None], -loads.cold.sum(axis=1)[:, None])
+        dx, df = z[:n], z[n:]
+        return Ahead(*(each.reshape(-1, 3) for each in (moves, dx, df, dy)))
 
     def left(self, flipped: BoolArray) -> float:
         """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
@@ -292,7 +304,8 @@ def influence(
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
     gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
     view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)
-    return Influence(tets, view.shape(problem, y), limits.values, change[:, :width], change[:, width:], view)
+    shape_change, limit_change = change[:, :width], change[:, width:]
+    return Influence(tets, view.shape(problem, y), limits.values, shape_change, limit_change, view, lin, loads)
 
 
 # -- from loads to measures

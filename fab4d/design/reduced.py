@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -10,7 +11,16 @@ from scipy.sparse import csr_array
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.exchange import exchanged
 from fab4d.design.forward import load
-from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, gauss_newton_step, held_positions
+from fab4d.design.gauss_newton import (
+    Ahead,
+    Design,
+    build_model,
+    equilibrate,
+    evaluate,
+    gauss_newton_step,
+    guessed,
+    held_positions,
+)
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.problem import Problem
@@ -385,34 +395,58 @@ def change_density(
     rho: FloatArray,
     smallest: float = 1e-3,
     stay: bool = False,
-    moves: FloatArray | None = None,
+    ahead: Ahead | None = None,
 ) -> Design:
     """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
 
     smallest : share of the way that a step may come down to        stay : see `newton`
-    moves : (3K,) of the held positions, made along with the density
-    A length that has failed is not tried again before BEFORE_LONGER steps of half of it have led on.
+    ahead : what the change does, held positions that move along with the density included; unloading, which takes
+        longer, then leads on only where no step from there comes to an equilibrium
     Raises EquilibriumError when the path ends before.
     """
-    start, done, step = design.rho, 0.0, 1.0
-    failed, led_on = np.inf, 0
-    held = held_positions(equilibria, design.median)
-    while done < 1.0:
+    start, held = design.rho, held_positions(equilibria, design.median)
+    moves = np.zeros_like(held) if ahead is None else ahead.moves
+
+    def led_to(at: Design, done: float, aim: float) -> Design | None:  # noqa: ARG001
+        guess = at.median.x, at.median.forces, at.final.y
+        mixed, moved = start + aim * (rho - start), held + aim * moves
+        return equilibrate(equilibria, mixed, moved, *guess, stay=stay, by_unloading=True)
+
+    def predicted(at: Design, done: float, aim: float, ahead: Ahead) -> Design | None:
+        mixed, moved = start + aim * (rho - start), held + aim * moves
+        guess = guessed(equilibria, at, mixed, ahead.part(aim - done))
+        return equilibrate(equilibria, mixed, moved, *guess, stay=stay)
+
+    done = 0.0
+    if ahead is not None:
+        design, done = _followed(design, done, partial(predicted, ahead=ahead), smallest)
+    if done < 1.0:
+        design, done = _followed(design, done, led_to, smallest)
+    if done < 1.0:
+        msg = "the printed labels have no equilibrium near that of the relaxed design"
+        raise EquilibriumError(msg)
+    return design
+
+
+def _followed(
+    design: Design, done: float, lead: Callable[[Design, float, float], Design | None], smallest: float
+) -> tuple[Design, float]:
+    """The last design that `lead` comes to from `done` on the way to 1, and where it is.
+
+    lead : a design, where it is and where to -> the design there
+    A length that has failed is not tried again before BEFORE_LONGER steps of half of it have led on.
+    """
+    step, failed, led_on = 1.0 - done, np.inf, 0
+    while done < 1.0 and step >= smallest:
         aim = min(1.0, done + step)
-        mixed = start + aim * (rho - start)
-        moved = held if moves is None else held + aim * moves.reshape(-1, 3)
-        x, forces, y = design.median.x, design.median.forces, design.final.y
-        trial = equilibrate(equilibria, mixed, moved, x, forces, y, stay=stay, by_unloading=True)
+        trial = lead(design, done, aim)
         if trial is not None:
             design, done, led_on = trial, aim, led_on + 1
             if 2 * step < failed or led_on == BEFORE_LONGER:
                 step, failed = 2 * step, np.inf
         else:
             step, failed, led_on = step / 2, step, 0
-        if step < smallest:
-            msg = "the printed labels have no equilibrium near that of the relaxed design"
-            raise EquilibriumError(msg)
-    return design
+    return design, done
 
 
 def refit(

@@ -23,8 +23,9 @@ class Status(Enum):
 
 
 MAX_HALVINGS = 20
-# A guess may be unstable where the equilibrium near it is not. From this iteration on, an unstable state leads away.
-ASTRAY = 3
+# A guess may be unstable where the equilibrium near it is not. From this iteration on, an unstable state leads away:
+# nearly all ways that come to something are stable again one step from the guess.
+ASTRAY = 1
 # Steps with an old factor are far cheaper than those with a new one, as long as each leaves this share of the residual
 # at most.
 CHORD_GAIN = 0.3

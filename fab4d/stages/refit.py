@@ -8,9 +8,9 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, held_moves, mended, polish_labels
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, mended, polish_labels, predicted
 from fab4d.design.forward import Programming, program, same_shape
-from fab4d.design.gauss_newton import Design
+from fab4d.design.gauss_newton import Ahead, Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
@@ -138,29 +138,20 @@ def _ways(
 ) -> Iterator[_Printed | None]:
     """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
 
-    smp : (m,) its repair
+    smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
+    changes.
     """
-    flips, rounded = influence_near(equilibria, before, smp, weights), before.rho > 0.5
+    problem, rounded = equilibria.problem, before.rho > 0.5
+    flips = influence_near(equilibria, before, smp, weights)
     if flips is not None:
-        better = compensated(equilibria.problem, flips, rounded, smp, settings)
+        better = compensated(problem, flips, rounded, smp, settings)
         if (better != smp).any():
-            yield _followed(equilibria, before, better, weights, held_moves(flips, rounded, better))
-    moves = None if flips is None else held_moves(flips, rounded, smp)
-    yield _followed(equilibria, before, smp, weights, moves)
-    yield _mended(equilibria, before, weights, settings)
-
-
-def _mended(
-    equilibria: Equilibria, before: Design, weights: ObjectiveWeights, settings: FlipSettings
-) -> _Printed | None:
-    """Labels of a near 0/1 design that are mended for little error rather than by few changes, and made printable.
-
-    None where nothing is mended or no equilibria lead to them.
-    """
-    design = mended(equilibria, before, weights, settings, FEW_STEPS)
-    if design is before:
-        return None
-    return _followed(equilibria, design, settings.printable(design.rho > 0.5), weights)
+            yield _followed(equilibria, before, better, weights, predicted(flips, rounded, better))
+    yield _followed(equilibria, before, smp, weights, None if flips is None else predicted(flips, rounded, smp))
+    if flips is not None:
+        other = mended(problem, flips, rounded, settings)
+        if (other != smp).any():
+            yield _followed(equilibria, before, other, weights, predicted(flips, rounded, other))
 
 
 def _followed(
@@ -168,17 +159,17 @@ def _followed(
     before: Design,
     smp: BoolArray,
     weights: ObjectiveWeights,
-    moves: FloatArray | None = None,
+    ahead: Ahead | None = None,
     patient: bool = False,
 ) -> _Printed | None:
     """The labels smp (m,); None where no path of equilibria leads to them.
 
-    moves : (3K,) of the held positions on the way
+    ahead : what the change does, moves of the held positions on the way included
     patient : whether small steps are made too and the path may lead past unstable states, which takes minutes
     """
     smallest = PATIENT_STEP if patient else SMALLEST_STEP
     try:
-        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient, moves=moves)
+        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient, ahead=ahead)
     except EquilibriumError:
         return None
     if not equilibria.patches.count:

@@ -20,11 +20,11 @@ from fab4d.design.flips import (
     near_interface,
     polish_labels,
 )
-from fab4d.design.gauss_newton import Design, equilibrate, held_positions
+from fab4d.design.gauss_newton import Ahead, Design, equilibrate, held_positions
 from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import at_rest, refit
+from fab4d.design.reduced import refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.annealing import annealer
 from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
@@ -184,14 +184,15 @@ def test_held_positions_move_along_with_flips() -> None:
     design = refit(equilibria, before, WEIGHTS, lambda at: None)  # noqa: ARG005
     found, labels = at_all_tets(equilibria, design), smp.copy()
     labels[np.flatnonzero(at_interface(problem, smp))[::4]] ^= True
-    moves = flips.held_moves(found, smp, labels)
-    assert moves.shape == (6,)
-    assert np.abs(moves).max() > 0
-    still, moved = (flips._changed(equilibria, design, labels, each) for each in (0 * moves, moves))
+    ahead = flips.predicted(found, smp, labels)
+    assert ahead.moves.shape == (2, 3)
+    assert np.abs(ahead.moves).max() > 0
+    none = replace(ahead, moves=np.zeros((2, 3)))
+    still, moved = (flips._changed(equilibria, design, labels, each) for each in (none, ahead))
     assert still is not None
     assert moved is not None
     held = held_positions(equilibria, moved.median)
-    np.testing.assert_allclose(held, held_positions(equilibria, design.median) + moves.reshape(2, 3), atol=1e-9)
+    np.testing.assert_allclose(held, held_positions(equilibria, design.median) + ahead.moves, atol=1e-9)
     fitted = refit(equilibria, still, WEIGHTS, lambda at: None)  # noqa: ARG005
     errors = [shape_error(problem, each.final.y).rms for each in (fitted, moved, still)]
     assert errors[1] - errors[0] < 0.3 * (errors[2] - errors[0])
@@ -248,46 +249,27 @@ def test_a_repair_is_made_up_for() -> None:
 
 
 def test_pinched_labels_are_mended_near_the_wanted_shape() -> None:
-    """Better than by the flips that change the least volume, and without doubt; held positions and shapes follow."""
+    """Better than by the flips that change the least volume, and without doubt."""
     problem = bar(cells=(6, 3, 2), degrees=30.0)
     tets, volumes = problem.body.elements[:, :4], problem.volume_fractions
     equilibria, smp = two_patches(problem), upper_half(problem)
     smp[np.flatnonzero(at_interface(problem, smp))[::3]] ^= True
     assert len(pinched_vertices(tets, smp))
     design = held_design(equilibria, smp.astype(float), problem.X_temp)
-    energies = list[FlipEnergy]()
-    made = mended(equilibria, design, WEIGHTS, recording(freely(problem), energies), 3)
+    energies, asked, found = list[FlipEnergy](), list[np.ndarray](), at_all_tets(equilibria, design)
+    settings = replace(recording(freely(problem), energies), printable=lambda labels: asked.append(labels) or ~labels)
+    labels = ~mended(problem, found, smp, settings)
     assert len(energies) == 1
     assert not energies[0].doubts.any()
-    assert len(pinched_vertices(tets, made.rho > 0.5)) == 0
-    assert set(np.unique(made.rho)) == {0.0, 1.0}
-    least = well_composed(tets, smp, volumes).astype(float)
-    held = held_positions(equilibria, design.median)
-    other = equilibrate(equilibria, least, held, design.median.x, design.median.forces, design.final.y)
-    assert other is not None
-    fitted = refit(equilibria, other, WEIGHTS, lambda at: None, 3)  # noqa: ARG005
-    assert shape_error(problem, made.final.y).rms < shape_error(problem, fitted.final.y).rms
-
-
-def test_labels_stay_that_cannot_be_mended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No interface, no points, nothing that is mended, or no equilibrium of what is."""
-    problem = bar(degrees=30.0)
-    equilibria, smp = two_patches(problem), upper_half(problem)
-    smp[np.flatnonzero(at_interface(problem, smp))[::3]] ^= True
-    design = held_design(equilibria, smp.astype(float), problem.X_temp)
-    asked = replace(freely(problem), annealed=lambda labels, *rest: labels)  # noqa: ARG005
-    assert mended(equilibria, design, WEIGHTS, asked, 3) is design
-    plain = held_design(equilibria, np.zeros(problem.n_tets), problem.X_temp)
-    assert mended(equilibria, plain, WEIGHTS, freely(problem), 3) is plain
-    rest = at_rest(problem)
-    assert mended(rest.equilibria, rest.design, WEIGHTS, freely(problem), 3) is rest.design
-
-    def lost(*args: object, **named: object) -> Design:  # noqa: ARG001
-        msg = "none"
-        raise EquilibriumError(msg)
-
-    monkeypatch.setattr(flips, "change_density", lost)
-    assert mended(equilibria, design, WEIGHTS, freely(problem), 3) is design
+    np.testing.assert_array_equal(labels, asked[0])
+    assert len(pinched_vertices(tets, labels)) == 0
+    errors = []
+    for each in (labels, well_composed(tets, smp, volumes)):
+        held, median = held_positions(equilibria, design.median), design.median
+        other = equilibrate(equilibria, each.astype(float), held, median.x, median.forces, design.final.y)
+        assert other is not None
+        errors.append(shape_error(problem, refit(equilibria, other, WEIGHTS, lambda at: None, 3).final.y).rms)  # noqa: ARG005
+    assert errors[0] < errors[1]
 
 
 def test_what_comes_to_nothing_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,9 +298,9 @@ def test_what_is_taught_is_what_flips_do_at_the_same_held_positions(monkeypatch:
     design = held_design(equilibria, smp.astype(float), problem.X_temp)
     values, change, teach = iter([0.0, 1.0]), flips._changed, Influence.taught
 
-    def changed(at: Equilibria, before: Design, labels: np.ndarray, moves: np.ndarray) -> Design | None:
-        seen.append((change(at, before, labels, 0 * moves), moves))
-        return change(at, before, labels, moves)
+    def changed(at: Equilibria, before: Design, labels: np.ndarray, ahead: Ahead) -> Design | None:
+        seen.append((change(at, before, labels, replace(ahead, moves=0 * ahead.moves)), ahead.moves.ravel()))
+        return change(at, before, labels, ahead)
 
     def taught(self: Influence, flipped: np.ndarray, shape: np.ndarray, beyond: np.ndarray) -> Influence:
         still, moves = seen[-1]

@@ -10,7 +10,7 @@ from fab4d.design import influence as module
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flip_loads import cold_forces, hot_forces
 from fab4d.design.flips import at_interface
-from fab4d.design.gauss_newton import Design, equilibrate, held_positions
+from fab4d.design.gauss_newton import Design, equilibrate, guessed, held_positions
 from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error, squeeze, stretch_excess
 from fab4d.design.problem import Problem
@@ -151,6 +151,30 @@ def test_held_positions_take_away_what_they_can(state: tuple[Equilibria, Design,
     moved = np.random.default_rng(0).normal(size=len(by_held)) @ by_held
     assert np.linalg.norm(found.view.without_held(moved)) < 0.1 * np.linalg.norm(moved)
     assert np.linalg.norm(found.residual) <= shape_error(equilibria.problem, design.final.y).rms * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.03, 1e12])
+def test_equilibria_are_near_where_flips_are_predicted_to_lead(
+    state: tuple[Equilibria, Design, np.ndarray], monkeypatch: pytest.MonkeyPatch, damping: float
+) -> None:
+    """One flip, the held positions moved along or left where they are."""
+    monkeypatch.setattr(module, "HELD_DAMPING", damping)
+    equilibria, design, tets = state
+    found, problem = influence(equilibria, design, tets, WEIGHTS), equilibria.problem
+    for k in (0, 7):
+        flipped = np.arange(len(tets)) == k
+        ahead, rho = found.ahead(flipped), design.rho.copy()
+        rho[tets[k]] = 1 - rho[tets[k]]
+        held = held_positions(equilibria, design.median) + ahead.moves
+        true = equilibrate(equilibria, rho, held, *guessed(equilibria, design, rho, ahead))
+        assert true is not None
+        moved = true.median.x - design.median.x
+        assert np.linalg.norm(moved - ahead.x) < 0.4 * np.linalg.norm(moved)
+        start, end, guess = (
+            shape_error(problem, y).e for y in (design.final.y, true.final.y, design.final.y + ahead.y)
+        )
+        assert np.linalg.norm(guess - end) < 0.7 * np.linalg.norm(end - start)
+        assert (np.abs(ahead.moves).max() > 1e-3) == (damping < 1)
 
 
 def test_what_is_taught_is_predicted(state: tuple[Equilibria, Design, np.ndarray]) -> None:

@@ -413,6 +413,39 @@ def test_a_step_to_other_densities_that_failed_is_not_tried_again_soon(
     np.testing.assert_allclose(16 * np.array(tried), sixteenths)
 
 
+@pytest.mark.parametrize(("farthest", "by_unloading"), [(0.0, [1.0, 0.5, 1.0]), (0.5, [1.0, 0.75, 1.0]), (1.0, [])])
+def test_unloading_leads_on_where_prediction_does_not(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch, farthest: float, by_unloading: list[float]
+) -> None:
+    """Halfway to the end at once, from where prediction ends. Held positions move along on both parts of the way."""
+    start, n, moves, at = truth.design, truth.problem.n_tets, np.array([[0.01, -0.02, 0.03]]), [0.0]
+    unloaded: list[float] = []
+
+    def equilibrate(
+        _: Equilibria, rho: np.ndarray, held: np.ndarray, __: object, forces: np.ndarray, ___: object, **how: bool
+    ) -> Design | None:
+        aim = float(rho[0])
+        assert how["stay"]
+        np.testing.assert_allclose(held, held_positions(truth.equilibria, start.median) + aim * moves, atol=1e-12)
+        if "by_unloading" in how:
+            unloaded.append(aim)
+            found = aim - at[0] <= 0.5 * (1 - farthest)
+        else:
+            np.testing.assert_allclose(forces, start.median.forces + (aim - at[0]))
+            found = aim <= farthest
+        if not found:
+            return None
+        at[0] = aim
+        return replace(start, rho=rho)
+
+    monkeypatch.setattr(reduced, "equilibrate", equilibrate)
+    none = np.zeros_like(start.final.y)
+    ahead = gauss_newton.Ahead(moves, none, np.ones_like(moves), none)
+    found = change_density(truth.equilibria, replace(start, rho=np.zeros(n)), np.ones(n), 0.25, stay=True, ahead=ahead)
+    np.testing.assert_array_equal(found.rho, 1.0)
+    assert unloaded == by_unloading
+
+
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
     """With the true labels and points there is one answer, and the error goes to rounding."""
     problem, equilibria, true = truth.problem, truth.equilibria, truth.design
@@ -446,6 +479,7 @@ def test_no_step_gains_more_than_it_promises(truth: Truth, damping: float) -> No
     step = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, tries=1)
     value = gauss_newton.evaluate(equilibria, weights, L, design)
     assert step.accepted
+    assert step.damping == pytest.approx(damping / gauss_newton.SOFTER)
     share = (value - step.value) / value
     again = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 0.4 * share)
     never = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 2.5 * share)

@@ -60,6 +60,15 @@ def test_stays_where_it_is_when_told_to():
     assert np.abs(found.z).max() < 1e-4
 
 
+def test_an_unstable_guess_may_lead_to_a_stable_state_when_staying():
+    """If it is stable one step on."""
+    start = np.full(N, 0.5)
+    assert tangent(start).n_negative == 1
+    found = newton(wells, tangent, start, 1e-10, 20, no_fallback, stay=True)
+    assert found.converged
+    assert np.allclose(found.z, 1.0)
+
+
 def test_a_stable_state_is_found_when_staying():
     found = newton(wells, tangent, np.full(N, 0.9), 1e-10, 20, no_fallback, stay=True)
     assert found.converged

@@ -102,7 +102,6 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     smp = inputs["rounded"]["smp"]
     given = (equilibria, inputs["relaxed"], smp, weights, settings)
     monkeypatch.setattr(refit, "influence_near", lambda *_: None)
-    monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
     by_path = refit._printed_design(*given).design
 
     def not_taken(*_: Any) -> Design:
@@ -179,18 +178,18 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
     labels[1][np.flatnonzero(at_interface(problem, labels[0]))[::2]] ^= True
     made = [refit._printed_design(equilibria, inputs["relaxed"], smp, weights, enough) for smp in labels]
     best, worst = np.argsort([rms(problem, each.fitted) for each in made])
-    asked: list[Design] = []
+    asked: list[BoolArray] = []
 
-    def mended(at: Equilibria, before: Design, *_: Any) -> Design:  # noqa: ARG001
+    def mended(problem: Problem, flips: Any, before: BoolArray, settings: Any) -> BoolArray:  # noqa: ARG001
         asked.append(before)
-        return made[best].fitted
+        return labels[best]
 
     monkeypatch.setattr(refit, "mended", mended)
     for target, taken in ((enough, worst), (never, best)):
         printed = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, target)
         np.testing.assert_array_equal(printed.design.rho > 0.5, labels[taken])
         assert bool(asked) == (target is never)
-    monkeypatch.setattr(refit, "mended", lambda at, before, *_: before)  # noqa: ARG005
+    monkeypatch.setattr(refit, "mended", lambda *_: labels[worst])
     same = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, never)
     np.testing.assert_array_equal(same.design.rho > 0.5, labels[worst])
 
@@ -203,20 +202,22 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     smp = inputs["rounded"]["smp"]
     other = smp.copy()
     other[np.flatnonzero(at_interface(problem, smp))[0]] ^= True
+    third = smp.copy()
+    third[np.flatnonzero(at_interface(problem, smp))[1]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
     design = change_density(equilibria, before, other.astype(np.float64))
-    tried: list[BoolArray | None] = []
+    tried: list[BoolArray] = []
 
     def followed(*given: Any) -> refit._Printed:
-        _at, _before, labels, _weights, moves = given
-        assert np.abs(moves).max() > 0
+        _at, _before, labels, _weights, ahead = given
+        assert np.abs(ahead.moves).max() > 0
         tried.append(labels)
         return refit._Printed(design, design)
 
     monkeypatch.setattr(refit, "compensated", lambda *_: other)
     monkeypatch.setattr(refit, "_followed", followed)
-    monkeypatch.setattr(refit, "_mended", lambda *_: tried.append(None))
-    for share, ways in ((1.001, [other]), (0.999, [other, smp, None])):
+    monkeypatch.setattr(refit, "mended", lambda *_: third)
+    for share, ways in ((1.001, [other]), (0.999, [other, smp, third])):
         tried.clear()
         target = share * rms(problem, design) / refit.WITHIN_REACH
         refit._printed_design(equilibria, inputs["relaxed"], smp, weights, replace(settings, target_rms=target))
