@@ -102,7 +102,7 @@ def polish_labels(
         if settled.squared >= (1 - LEAST_ROUND_GAIN) * found.after(np.zeros_like(changed)).squared:
             price, poor = price / DEARER, poor + 1
             continue
-        trial = _changed(equilibria, design, flipped, found.ahead(changed))
+        trial = _changed(equilibria, design, flipped, found.ahead(changed, settled.moves))
         if trial is None:
             price, poor = DEARER * price, poor + 1
             continue
@@ -164,7 +164,8 @@ def fineness(problem: Problem) -> float:
 
 def predicted(found: Influence, before: BoolArray, smp: BoolArray) -> Ahead:
     """Where the labels smp (m,) instead of `before` (m,) lead, with the held positions that go best with them."""
-    return found.ahead((smp != before)[found.tets])
+    flipped = (smp != before)[found.tets]
+    return found.ahead(flipped, found.after(flipped).moves)
 
 
 def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, ahead: Ahead) -> Design | None:

@@ -195,12 +195,12 @@ class Influence:
         squared = float(shape @ shape + self.doubts[flipped].sum())
         return self.settled(squared, self.view.shape_by_held @ shape, beyond)
 
-    def ahead(self, flipped: BoolArray) -> Ahead:
-        """Where the equilibria are predicted with the tets `flipped` (k,) and the held positions settled."""
-        moves, loads, lin = self.after(flipped).moves, self.loads.of(np.flatnonzero(flipped)), self.lin
+    def ahead(self, flipped: BoolArray, moves: FloatArray) -> Ahead:
+        """Where the equilibria are predicted with the tets `flipped` (k,) and moves (3K,) of the held positions."""
+        loads = self.loads.of(np.flatnonzero(flipped))
         n = loads.hot.shape[0]
         hot = -np.concatenate([loads.hot.sum(axis=1), moves])
-        z, dy = lin.respond(hot[:, None], -loads.cold.sum(axis=1)[:, None])
+        z, dy = self.lin.respond(hot[:, None], -loads.cold.sum(axis=1)[:, None])
         dx, df = z[:n], z[n:]
         return Ahead(*(each.reshape(-1, 3) for each in (moves, dx, df, dy)))
 

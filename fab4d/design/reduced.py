@@ -407,28 +407,24 @@ def change_density(
     start, held = design.rho, held_positions(equilibria, design.median)
     moves = np.zeros_like(held) if ahead is None else ahead.moves
 
-    def led_to(at: Design, done: float, aim: float) -> Design | None:  # noqa: ARG001
+    def led_to(at: Design, done: float, aim: float, by_unloading: bool) -> Design | None:
+        mixed, moved = start + aim * (rho - start), held + aim * moves
         guess = at.median.x, at.median.forces, at.final.y
-        mixed, moved = start + aim * (rho - start), held + aim * moves
-        return equilibrate(equilibria, mixed, moved, *guess, stay=stay, by_unloading=True)
-
-    def predicted(at: Design, done: float, aim: float, ahead: Ahead) -> Design | None:
-        mixed, moved = start + aim * (rho - start), held + aim * moves
-        guess = guessed(equilibria, at, mixed, ahead.part(aim - done))
-        return equilibrate(equilibria, mixed, moved, *guess, stay=stay)
+        if ahead is not None and not by_unloading:
+            guess = guessed(equilibria, at, mixed, ahead.part(aim - done))
+        return equilibrate(equilibria, mixed, moved, *guess, stay=stay, by_unloading=by_unloading)
 
     done = 0.0
     if ahead is not None:
-        design, done = _followed(design, done, partial(predicted, ahead=ahead), smallest)
-    if done < 1.0:
-        design, done = _followed(design, done, led_to, smallest)
+        design, done = _along(design, done, partial(led_to, by_unloading=False), smallest)
+    design, done = _along(design, done, partial(led_to, by_unloading=True), smallest)
     if done < 1.0:
         msg = "the printed labels have no equilibrium near that of the relaxed design"
         raise EquilibriumError(msg)
     return design
 
 
-def _followed(
+def _along(
     design: Design, done: float, lead: Callable[[Design, float, float], Design | None], smallest: float
 ) -> tuple[Design, float]:
     """The last design that `lead` comes to from `done` on the way to 1, and where it is.

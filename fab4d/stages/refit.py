@@ -11,6 +11,7 @@ from fab4d.design.finish import carried_over
 from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, mended, polish_labels, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design
+from fab4d.design.influence import Influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
@@ -141,17 +142,23 @@ def _ways(
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
     changes.
     """
-    problem, rounded = equilibria.problem, before.rho > 0.5
-    flips = influence_near(equilibria, before, smp, weights)
+    flips, tried = influence_near(equilibria, before, smp, weights), list[BoolArray]()
+    for labels in _repairs(equilibria.problem, flips, before.rho > 0.5, smp, settings):
+        if not any((labels == other).all() for other in tried):
+            tried.append(labels)
+            ahead = None if flips is None else predicted(flips, before.rho > 0.5, labels)
+            yield _followed(equilibria, before, labels, weights, ahead)
+
+
+def _repairs(
+    problem: Problem, flips: Influence | None, rounded: BoolArray, smp: BoolArray, settings: FlipSettings
+) -> Iterator[BoolArray]:
+    """Printable labels near `rounded` (m,): smp (m,) and, where it is known what flips do, others."""
     if flips is not None:
-        better = compensated(problem, flips, rounded, smp, settings)
-        if (better != smp).any():
-            yield _followed(equilibria, before, better, weights, predicted(flips, rounded, better))
-    yield _followed(equilibria, before, smp, weights, None if flips is None else predicted(flips, rounded, smp))
+        yield compensated(problem, flips, rounded, smp, settings)
+    yield smp
     if flips is not None:
-        other = mended(problem, flips, rounded, settings)
-        if (other != smp).any():
-            yield _followed(equilibria, before, other, weights, predicted(flips, rounded, other))
+        yield mended(problem, flips, rounded, settings)
 
 
 def _followed(

@@ -163,7 +163,7 @@ def test_equilibria_are_near_where_flips_are_predicted_to_lead(
     found, problem = influence(equilibria, design, tets, WEIGHTS), equilibria.problem
     for k in (0, 7):
         flipped = np.arange(len(tets)) == k
-        ahead, rho = found.ahead(flipped), design.rho.copy()
+        ahead, rho = found.ahead(flipped, found.after(flipped).moves), design.rho.copy()
         rho[tets[k]] = 1 - rho[tets[k]]
         held = held_positions(equilibria, design.median) + ahead.moves
         true = equilibrate(equilibria, rho, held, *guessed(equilibria, design, rho, ahead))

@@ -427,7 +427,7 @@ def test_unloading_leads_on_where_prediction_does_not(
         aim = float(rho[0])
         assert how["stay"]
         np.testing.assert_allclose(held, held_positions(truth.equilibria, start.median) + aim * moves, atol=1e-12)
-        if "by_unloading" in how:
+        if how["by_unloading"]:
             unloaded.append(aim)
             found = aim - at[0] <= 0.5 * (1 - farthest)
         else:

@@ -197,6 +197,7 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
 def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And so are those that lead to the same labels as one before."""
     equilibria, weights, settings = fit_of(inputs)
     problem = equilibria.problem
     smp = inputs["rounded"]["smp"]
@@ -216,8 +217,12 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
 
     monkeypatch.setattr(refit, "compensated", lambda *_: other)
     monkeypatch.setattr(refit, "_followed", followed)
-    monkeypatch.setattr(refit, "mended", lambda *_: third)
-    for share, ways in ((1.001, [other]), (0.999, [other, smp, third])):
+    for share, last, ways in (
+        (1.001, third, [other]),
+        (0.999, third, [other, smp, third]),
+        (0.999, other, [other, smp]),
+    ):
+        monkeypatch.setattr(refit, "mended", lambda *_, labels=last: labels)
         tried.clear()
         target = share * rms(problem, design) / refit.WITHIN_REACH
         refit._printed_design(equilibria, inputs["relaxed"], smp, weights, replace(settings, target_rms=target))
