@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.gauss_newton import Ahead, Design, evaluate
+from fab4d.design.gauss_newton import LARGEST_MOVE, Ahead, Design, evaluate, held_positions
 from fab4d.design.influence import FlipEnergy, Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
+from fab4d.design.paths import follow_density
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Search, Watch, change_density, refit
+from fab4d.design.reduced import Search, Watch, refit
 from fab4d.errors import EquilibriumError
-from fab4d.mesh.tetmesh import BoolArray
+from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # So many tets near the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 1500
@@ -37,6 +38,9 @@ USUAL_TETS = 5_000
 # So many rounds in a row that gain less end it. Once the tolerance is met, a round is also poor after which the target
 # is more than MOST_TO_GO such rounds away, and fewer end it.
 MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 4
+# Moves of the held positions cost HELD_BACK times as much after flips whose equilibria are not found, for these mostly
+# lie too far off, and LET_GO times less after flips that come true. Beyond MOST_DAMPING it is not for these moves.
+HELD_BACK, LET_GO, MOST_DAMPING = 10.0, 3.0, 1e3
 # Flips whose equilibria are farther away than steps of this share of the change go are given up.
 SMALLEST_STEP = 0.25
 # Steps of the held positions after each round; once all are made, they are fitted to the end.
@@ -84,7 +88,7 @@ def polish_labels(
     plain = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
     value = evaluate(equilibria, plain, L, design)
     finer = fineness(problem)
-    price, poor = FIRST_PRICE / finer, 0
+    price, poor, damping = FIRST_PRICE / finer, 0, 1.0
     found: Influence | None = None
     for seed in range(settings.rounds):
         rms = shape_error(problem, design.final.y).rms
@@ -95,16 +99,18 @@ def polish_labels(
             tets = np.flatnonzero(near_interface(problem, smp))
             if not tets.size:
                 break
-            found = influence(equilibria, design, tets, plain, int(MOST_CANDIDATES * finer))
+            found = influence(equilibria, design, tets, plain, int(MOST_CANDIDATES * finer)).damped(damping)
         flipped = settings.printable(flip(problem, found, smp, smp, settings, price, STEPS, seed))
         changed = (flipped != smp)[found.tets]
         settled = found.after(changed)
         if settled.squared >= (1 - LEAST_ROUND_GAIN) * found.after(np.zeros_like(changed)).squared:
             price, poor = price / DEARER, poor + 1
             continue
-        trial = _changed(equilibria, design, flipped, found.ahead(changed, settled.moves))
+        ahead = None if _too_far(settled.moves) else found.ahead(changed, settled.moves)
+        trial = None if ahead is None else _changed(equilibria, design, flipped, plain, ahead)
         if trial is None:
-            price, poor = DEARER * price, poor + 1
+            price, poor = DEARER * price, poor + (damping >= MOST_DAMPING)
+            found, damping = found.damped(HELD_BACK), HELD_BACK * damping
             continue
         fitted = refit(equilibria, trial, plain, lambda at: None, iterations=FOLLOWING_STEPS)  # noqa: ARG005
         new, new_rms = evaluate(equilibria, plain, L, fitted), shape_error(problem, fitted.final.y).rms
@@ -112,12 +118,12 @@ def polish_labels(
         poor = poor + 1 if far or new > (1 - LEAST_ROUND_GAIN) * value else 0
         if new < value:
             design, value, found = fitted, new, None
-            price /= CHEAPER
+            price, damping = price / CHEAPER, max(damping / LET_GO, 1.0)
             watch(Search(equilibria, design))
         else:
-            view = found.view
-            shape = view.shape(problem, trial.final.y) - settled.moves @ view.shape_by_held
-            limits = view.limits.at(trial.median) - settled.moves @ view.limits_by_held
+            view, moves = found.view, _moves(equilibria, design, trial)
+            shape = view.shape(problem, trial.final.y) - moves @ view.shape_by_held
+            limits = view.limits.at(trial.median) - moves @ view.limits_by_held
             found, price = found.taught(changed, shape, limits), DEARER * price
     return refit(equilibria, design, weights, watch) if design is not start else start
 
@@ -163,17 +169,33 @@ def fineness(problem: Problem) -> float:
 
 
 def predicted(found: Influence, before: BoolArray, smp: BoolArray) -> Ahead:
-    """Where the labels smp (m,) instead of `before` (m,) lead, with the held positions that go best with them."""
+    """Where the labels smp (m,) instead of `before` (m,) lead, with the held positions that go best with them.
+
+    They are held back until none moves farther than a linear prediction is of use.
+    """
     flipped = (smp != before)[found.tets]
-    return found.ahead(flipped, found.after(flipped).moves)
+    while _too_far(moves := found.after(flipped).moves):
+        found = found.damped(HELD_BACK)
+    return found.ahead(flipped, moves)
 
 
-def _changed(equilibria: Equilibria, design: Design, labels: BoolArray, ahead: Ahead) -> Design | None:
-    """The design with these labels (m,), its held positions moved; None where it has no stable equilibrium near."""
+def _too_far(moves: FloatArray) -> bool:
+    return bool(np.abs(moves).max(initial=0.0) > LARGEST_MOVE)
+
+
+def _changed(
+    equilibria: Equilibria, design: Design, labels: BoolArray, weights: ObjectiveWeights, ahead: Ahead
+) -> Design | None:
+    """The design with these labels (m,), held positions following; None where it has no stable equilibrium near."""
     try:
-        return change_density(equilibria, design, labels.astype(np.float64), SMALLEST_STEP, stay=True, ahead=ahead)
+        return follow_density(equilibria, design, labels.astype(np.float64), weights, ahead, SMALLEST_STEP)
     except EquilibriumError:
         return None
+
+
+def _moves(equilibria: Equilibria, before: Design, after: Design) -> FloatArray:
+    """(3K,) of the held positions from one design to another."""
+    return (held_positions(equilibria, after.median) - held_positions(equilibria, before.median)).ravel()
 
 
 def flip(

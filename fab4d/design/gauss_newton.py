@@ -288,7 +288,8 @@ def gauss_newton_step(
         dc = damped.held_step(drho)
         # The model falls by this at most: its quadratic part takes some of it back.
         promised = -float(model.gradient_rho @ drho + model.gradient_c @ dc.ravel())
-        trial = _trial(equilibria, model, design, drho, dc, stay) if promised > least_promise * value else None
+        rho = np.clip(design.rho + drho, 0, 1)
+        trial = _trial(equilibria, model, design, rho, dc, stay) if promised > least_promise * value else None
         if trial is not None:
             new = evaluate(equilibria, weights, L, trial)
             if new < value:
@@ -325,14 +326,25 @@ def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | Non
     return drho
 
 
+def prescribed_step(
+    equilibria: Equilibria, model: Model, design: Design, rho: FloatArray, damping: float
+) -> Design | None:
+    """The design with density rho (m,) and the held positions that go best with it by a model of `design`.
+
+    None where the model goes too far to be of use, or no equilibrium is found near it.
+    """
+    dc = model.damped(damping, equilibria.problem.volume_fractions).held_step(rho - design.rho)
+    return _trial(equilibria, model, design, rho, dc, stay=True)
+
+
 def _trial(
-    equilibria: Equilibria, model: Model, design: Design, drho: FloatArray, dc: FloatArray, stay: bool
+    equilibria: Equilibria, model: Model, design: Design, rho: FloatArray, dc: FloatArray, stay: bool
 ) -> Design | None:
     """The equilibria after a step, from its linear prediction; None where that goes too far to be of use."""
-    dx, df, dy = model.lin.forward(drho, dc)
+    dx, df, dy = model.lin.forward(rho - design.rho, dc)
     if max(np.abs(dx).max(), np.abs(dy).max()) > LARGEST_MOVE:
         return None
-    rho, held = np.clip(design.rho + drho, 0, 1), held_positions(equilibria, design.median) + dc
+    held = held_positions(equilibria, design.median) + dc
     guess = guessed(equilibria, design, rho, Ahead(dc, dx, df, dy))
     most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
     return equilibrate(equilibria, rho, held, *guess, max_iterations=most, stay=stay, near=model.lin)

@@ -92,7 +92,7 @@ class View:
     on_surface (s,) : dofs that are looked at        root (s,) : roots of their area weights
     basis (s, p) : orthonormal measures of it; None for all        rigid (s, 6) : weighted, orthonormal rigid modes
     shape_by_held (3K, p), limits_by_held (3K, l) : derivatives by the held positions
-    gram (3K, 3K) : what moves of the held positions cost, their effect on the shape included
+    ridge : what a move of a held position costs, squared errors for a squared length
     """
 
     on_surface: IntArray
@@ -102,7 +102,12 @@ class View:
     limits: Limits
     shape_by_held: FloatArray
     limits_by_held: FloatArray
-    gram: FloatArray
+    ridge: float
+
+    @cached_property
+    def gram(self) -> FloatArray:
+        """(3K, 3K) what moves of the held positions cost, their effect on the shape included."""
+        return self.shape_by_held @ self.shape_by_held.T + self.ridge * np.eye(len(self.shape_by_held))
 
     def shape(self, problem: Problem, y: FloatArray) -> FloatArray:
         """(p,) error of the final shape y (N, 3)."""
@@ -204,6 +209,10 @@ class Influence:
         dx, df = z[:n], z[n:]
         return Ahead(*(each.reshape(-1, 3) for each in (moves, dx, df, dy)))
 
+    def damped(self, factor: float) -> "Influence":
+        """The same with moves of the held positions that cost so many times as much."""
+        return replace(self, view=replace(self.view, ridge=factor * self.view.ridge))
+
     def left(self, flipped: BoolArray) -> float:
         """The error, L0, with the tets `flipped` (k,) and the held positions settled, limits included."""
         return float(np.sqrt(self.after(flipped).squared))
@@ -302,8 +311,7 @@ def influence(
         change, by_held = _in_modes(lin, loads, gradients(modes, each_limit))
     width = change.shape[1] - n_limits
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
-    gram = by_held[:, :width] @ by_held[:, :width].T + ridge * np.eye(len(by_held))
-    view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], gram)
+    view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], ridge)
     shape_change, limit_change = change[:, :width], change[:, width:]
     return Influence(tets, view.shape(problem, y), limits.values, shape_change, limit_change, view, lin, loads)
 

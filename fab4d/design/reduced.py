@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -11,18 +10,10 @@ from scipy.sparse import csr_array
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.exchange import exchanged
 from fab4d.design.forward import load
-from fab4d.design.gauss_newton import (
-    Ahead,
-    Design,
-    build_model,
-    equilibrate,
-    evaluate,
-    gauss_newton_step,
-    guessed,
-    held_positions,
-)
+from fab4d.design.gauss_newton import Design, build_model, evaluate, gauss_newton_step, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
+from fab4d.design.paths import change_density
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.measures import face_area_vectors
@@ -55,8 +46,6 @@ FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
 # that promises less than the second.
 SLOW_REFIT, LEAST_PROMISE, REFIT_TRIES = 1e-2, 1e-3, 12
-# So many steps on the way to other densities lead on before a longer one is tried: one that failed fails mostly again.
-BEFORE_LONGER = 3
 # The smallest number of points is looked for from here.
 FIRST_COUNT = 4
 
@@ -387,62 +376,6 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
 
 
 # -- refit
-
-
-def change_density(
-    equilibria: Equilibria,
-    design: Design,
-    rho: FloatArray,
-    smallest: float = 1e-3,
-    stay: bool = False,
-    ahead: Ahead | None = None,
-) -> Design:
-    """The design with density rho (m,) at the same held positions, along a path of equilibria where one step fails.
-
-    smallest : share of the way that a step may come down to        stay : see `newton`
-    ahead : what the change does, held positions that move along with the density included; unloading, which takes
-        longer, then leads on only where no step from there comes to an equilibrium
-    Raises EquilibriumError when the path ends before.
-    """
-    start, held = design.rho, held_positions(equilibria, design.median)
-    moves = np.zeros_like(held) if ahead is None else ahead.moves
-
-    def led_to(at: Design, done: float, aim: float, by_unloading: bool) -> Design | None:
-        mixed, moved = start + aim * (rho - start), held + aim * moves
-        guess = at.median.x, at.median.forces, at.final.y
-        if ahead is not None and not by_unloading:
-            guess = guessed(equilibria, at, mixed, ahead.part(aim - done))
-        return equilibrate(equilibria, mixed, moved, *guess, stay=stay, by_unloading=by_unloading)
-
-    done = 0.0
-    if ahead is not None:
-        design, done = _along(design, done, partial(led_to, by_unloading=False), smallest)
-    design, done = _along(design, done, partial(led_to, by_unloading=True), smallest)
-    if done < 1.0:
-        msg = "the printed labels have no equilibrium near that of the relaxed design"
-        raise EquilibriumError(msg)
-    return design
-
-
-def _along(
-    design: Design, done: float, lead: Callable[[Design, float, float], Design | None], smallest: float
-) -> tuple[Design, float]:
-    """The last design that `lead` comes to from `done` on the way to 1, and where it is.
-
-    lead : a design, where it is and where to -> the design there
-    A length that has failed is not tried again before BEFORE_LONGER steps of half of it have led on.
-    """
-    step, failed, led_on = 1.0 - done, np.inf, 0
-    while done < 1.0 and step >= smallest:
-        aim = min(1.0, done + step)
-        trial = lead(design, done, aim)
-        if trial is not None:
-            design, done, led_on = trial, aim, led_on + 1
-            if 2 * step < failed or led_on == BEFORE_LONGER:
-                step, failed = 2 * step, np.inf
-        else:
-            step, failed, led_on = step / 2, step, 0
-    return design, done
 
 
 def refit(

@@ -11,8 +11,9 @@ from fab4d.design.flips import polish_labels
 from fab4d.design.forward import program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.paths import change_density
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Search, change_density, refit
+from fab4d.design.reduced import Search, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import ambiguous_fraction, isolated_fraction, rounded_labels
 from fab4d.io.scene import Goal, PrinterCard

@@ -14,8 +14,9 @@ from fab4d.design.gauss_newton import Ahead, Design
 from fab4d.design.influence import Influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
+from fab4d.design.paths import change_density, follow_density
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Search, change_density, polished, refit
+from fab4d.design.reduced import Search, polished, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.annealing import annealer
 from fab4d.fabrication.labels import smp_clusters
@@ -171,12 +172,16 @@ def _followed(
 ) -> _Printed | None:
     """The labels smp (m,); None where no path of equilibria leads to them.
 
-    ahead : what the change does, moves of the held positions on the way included
+    ahead : what the change does; the held positions follow, else they stay
     patient : whether small steps are made too and the path may lead past unstable states, which takes minutes
     """
-    smallest = PATIENT_STEP if patient else SMALLEST_STEP
+    rho = smp.astype(np.float64)
     try:
-        design = change_density(equilibria, before, smp.astype(np.float64), smallest, stay=not patient, ahead=ahead)
+        if ahead is not None:
+            design = follow_density(equilibria, before, rho, weights, ahead, SMALLEST_STEP)
+        else:
+            smallest = PATIENT_STEP if patient else SMALLEST_STEP
+            design = change_density(equilibria, before, rho, smallest, stay=not patient)
     except EquilibriumError:
         return None
     if not equilibria.patches.count:

@@ -10,8 +10,8 @@ from bars import bar, held_design, two_patches
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design, equilibrate, held_positions
+from fab4d.design.paths import change_density
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import change_density
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.solvers.newton import Status
 

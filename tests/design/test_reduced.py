@@ -10,16 +10,16 @@ from bars import CARD, CLAMPED, bar, corner, held_design, two_patches
 from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
-from fab4d.design.gauss_newton import Design, held_positions
+from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces, spread_centers
+from fab4d.design.paths import change_density
 from fab4d.design.problem import Problem, build_problem
 from fab4d.design.reduced import (
     Phase,
     ReducedSettings,
     Search,
     at_rest,
-    change_density,
     decided,
     decided_by_and_by,
     fewest_points,
@@ -391,61 +391,6 @@ def test_without_an_equilibrium_nothing_is_decided_by_and_by(
     assert next(calls) == lost + 1
 
 
-def test_a_step_to_other_densities_that_failed_is_not_tried_again_soon(
-    truth: Truth, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Shares of the way that are aimed at where steps of more than a sixteenth lead nowhere at first."""
-    start, tried, at = truth.design, list[float](), [0.0]
-
-    def equilibrate(_equilibria: Equilibria, rho: np.ndarray, *_: object, **__: object) -> Design | None:
-        aim = float(rho[0])
-        tried.append(aim)
-        if aim - at[0] > 1 / 16 and at[0] < 0.25:
-            return None
-        at[0] = aim
-        return replace(start, rho=rho)
-
-    monkeypatch.setattr(reduced, "equilibrate", equilibrate)
-    n = truth.problem.n_tets
-    found = change_density(truth.equilibria, replace(start, rho=np.zeros(n)), np.ones(n))
-    np.testing.assert_array_equal(found.rho, 1.0)
-    sixteenths = [16, 8, 4, 2, 1, 2, 3, 5, 4, 5, 6, 8, 12, 16]
-    np.testing.assert_allclose(16 * np.array(tried), sixteenths)
-
-
-@pytest.mark.parametrize(("farthest", "by_unloading"), [(0.0, [1.0, 0.5, 1.0]), (0.5, [1.0, 0.75, 1.0]), (1.0, [])])
-def test_unloading_leads_on_where_prediction_does_not(
-    truth: Truth, monkeypatch: pytest.MonkeyPatch, farthest: float, by_unloading: list[float]
-) -> None:
-    """Halfway to the end at once, from where prediction ends. Held positions move along on both parts of the way."""
-    start, n, moves, at = truth.design, truth.problem.n_tets, np.array([[0.01, -0.02, 0.03]]), [0.0]
-    unloaded: list[float] = []
-
-    def equilibrate(
-        _: Equilibria, rho: np.ndarray, held: np.ndarray, __: object, forces: np.ndarray, ___: object, **how: bool
-    ) -> Design | None:
-        aim = float(rho[0])
-        assert how["stay"]
-        np.testing.assert_allclose(held, held_positions(truth.equilibria, start.median) + aim * moves, atol=1e-12)
-        if how["by_unloading"]:
-            unloaded.append(aim)
-            found = aim - at[0] <= 0.5 * (1 - farthest)
-        else:
-            np.testing.assert_allclose(forces, start.median.forces + (aim - at[0]))
-            found = aim <= farthest
-        if not found:
-            return None
-        at[0] = aim
-        return replace(start, rho=rho)
-
-    monkeypatch.setattr(reduced, "equilibrate", equilibrate)
-    none = np.zeros_like(start.final.y)
-    ahead = gauss_newton.Ahead(moves, none, np.ones_like(moves), none)
-    found = change_density(truth.equilibria, replace(start, rho=np.zeros(n)), np.ones(n), 0.25, stay=True, ahead=ahead)
-    np.testing.assert_array_equal(found.rho, 1.0)
-    assert unloaded == by_unloading
-
-
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
     """With the true labels and points there is one answer, and the error goes to rounding."""
     problem, equilibria, true = truth.problem, truth.equilibria, truth.design
@@ -530,12 +475,3 @@ def test_at_rest_nothing_is_held_and_nothing_moves(truth: Truth) -> None:
     rest = at_rest(truth.problem)
     assert rest.equilibria.patches.count == 0
     np.testing.assert_array_equal(rest.design.final.y, truth.problem.body.X)
-
-
-def test_change_density_keeps_the_held_positions(searched: list[Search]) -> None:
-    found = searched[len(searched) // 2]
-    design = change_density(found.equilibria, found.design, np.round(found.design.rho))
-    before, after = (held_positions(found.equilibria, at.median) for at in (found.design, design))
-    gap = after - before
-    assert np.abs(gap).max() < 1e-5
-    np.testing.assert_array_equal(design.rho, np.round(found.design.rho))

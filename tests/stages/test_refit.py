@@ -2,7 +2,9 @@
 
 import csv
 import io
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,8 @@ from fab4d.design.flips import FlipSettings, at_interface
 from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.paths import change_density, follow_density
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import change_density
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
@@ -108,7 +110,8 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
         raise AssertionError
 
     monkeypatch.setattr(refit, "MANY_TETS", 1)
-    monkeypatch.setattr(refit, "change_density", not_taken)
+    for path in ("change_density", "follow_density"):
+        monkeypatch.setattr(refit, path, not_taken)
     at_once = refit._printed_design(*given).design
     np.testing.assert_allclose(at_once.median.x, by_path.median.x, atol=1e-5)
     R, t = best_rigid_motion(at_once.final.y, by_path.final.y)
@@ -127,17 +130,25 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
     smp = inputs["rounded"]["smp"]
     asked: list[bool] = []
 
-    def found_by(patience: set[bool]) -> Design:
+    def found_by(patient_or_not: set[bool]) -> Design:
         asked.clear()
 
-        def hard(at: Equilibria, before: Design, rho: FloatArray, smallest: float, **named: Any) -> Design:
-            asked.append(not named["stay"])
-            if asked[-1] not in patience:
+        def quickly(*given: Any) -> Design:
+            return asked_for(False, follow_density, *given)
+
+        def patient(*given: Any, stay: bool) -> Design:
+            assert not stay
+            return asked_for(True, partial(change_density, stay=stay), *given)
+
+        def asked_for(patience: bool, follow: Callable[..., Design], *given: Any) -> Design:
+            asked.append(patience)
+            if patience not in patient_or_not:
                 msg = "none"
                 raise EquilibriumError(msg)
-            return change_density(at, before, rho, smallest, **named)
+            return follow(*given)
 
-        monkeypatch.setattr(refit, "change_density", hard)
+        monkeypatch.setattr(refit, "follow_density", quickly)
+        monkeypatch.setattr(refit, "change_density", patient)
         return refit._printed_design(equilibria, inputs["relaxed"], smp, weights, settings).design
 
     at_once = found_by({False, True})
