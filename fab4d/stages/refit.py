@@ -8,7 +8,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, mended, polish_labels, predicted
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, error_left, mended, polish_labels, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design
 from fab4d.design.influence import Influence
@@ -45,6 +45,8 @@ LOW_ERROR = 0.15
 WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
+# An error of printed labels up to this multiple of the predicted one has come true.
+COMES_TRUE = 1.5
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
 Polish = Callable[[Design], Design]
@@ -141,14 +143,20 @@ def _ways(
     """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
 
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
-    changes.
+    changes. Once a prediction has come true, labels that are predicted to be no better are left out.
     """
-    flips, tried = influence_near(equilibria, before, smp, weights), list[BoolArray]()
-    for labels in _repairs(equilibria.problem, flips, before.rho > 0.5, smp, settings):
-        if not any((labels == other).all() for other in tried):
-            tried.append(labels)
-            ahead = None if flips is None else predicted(flips, before.rho > 0.5, labels)
-            yield _followed(equilibria, before, labels, weights, ahead)
+    flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
+    came_true = np.inf
+    for labels in _repairs(equilibria.problem, flips, rounded, smp, settings):
+        left = -np.inf if flips is None else error_left(flips, rounded, labels)
+        if left >= came_true or any((labels == other).all() for other in tried):
+            continue
+        tried.append(labels)
+        ahead = None if flips is None else predicted(flips, rounded, labels)
+        followed = _followed(equilibria, before, labels, weights, ahead)
+        if followed is not None and shape_error(equilibria.problem, followed.fitted.final.y).rms <= COMES_TRUE * left:
+            came_true = left
+        yield followed
 
 
 def _repairs(

@@ -241,6 +241,37 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
         assert all(np.array_equal(got, way) for got, way in zip(tried, ways, strict=True))
 
 
+@pytest.mark.parametrize(("comes_true", "ways"), [(1.4, [0, 2]), (1.6, [0, 1, 2])])
+def test_labels_that_are_predicted_to_be_no_better_than_what_came_true_are_not_followed(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, comes_true: float, ways: list[int]
+) -> None:
+    """The second are predicted to be worse than the first, the third to be better."""
+    equilibria, weights, settings = fit_of(inputs)
+    smp = inputs["rounded"]["smp"]
+    labels = [smp.copy(), smp, smp.copy()]
+    for k in (0, 2):
+        labels[k][np.flatnonzero(at_interface(equilibria.problem, smp))[k]] ^= True
+    before = refit._relaxed_design(equilibria, inputs["relaxed"])
+    printed = refit._Printed(before, before)
+    predicted_rms = rms(equilibria.problem, before) / comes_true * np.array([1.0, 1.1, 0.9])
+    tried: list[int] = []
+
+    def number(some: BoolArray) -> int:
+        return next(k for k, each in enumerate(labels) if np.array_equal(each, some))
+
+    def followed(_: Equilibria, __: Design, some: BoolArray, *___: Any) -> refit._Printed:
+        tried.append(number(some))
+        return printed
+
+    monkeypatch.setattr(refit, "compensated", lambda *_: labels[0])
+    monkeypatch.setattr(refit, "mended", lambda *_: labels[2])
+    monkeypatch.setattr(refit, "error_left", lambda _, __, some: predicted_rms[number(some)])
+    monkeypatch.setattr(refit, "_followed", followed)
+    never = replace(settings, target_rms=0.0)
+    refit._printed_design(equilibria, inputs["relaxed"], smp, weights, never)
+    assert tried == ways
+
+
 def rms(problem: Problem, design: Design) -> float:
     return shape_error(problem, design.final.y).rms
 
