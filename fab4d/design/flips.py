@@ -23,8 +23,10 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 # So many tets near the interface, those that promise most, are candidates of a round.
 MOST_CANDIDATES = 1500
 # A flip has to lower the predicted squared error by this share of it: less once a round has come true, more once one
-# has not, for many flips at once are predicted worse than few.
+# has not, for many flips at once are predicted worse than few. A round that wins at least the first share of what it
+# promised has come true, one that wins less than the second has not.
 FIRST_PRICE, CHEAPER, DEARER = 3e-4, 1.5, 3.0
+CAME_TRUE, CAME_TO_LITTLE = 0.6, 0.3
 # By so much where no equilibrium tells whether it comes true.
 SURE_PRICE = 1e-3
 # A place that is pinched is worth this share to be mended.
@@ -37,7 +39,7 @@ STEPS, FEW_STEPS = 2000, 300
 USUAL_TETS = 5_000
 # So many rounds in a row that gain less end it. Once the tolerance is met, a round is also poor after which the target
 # is more than MOST_TO_GO such rounds away, and fewer end it.
-MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 4
+MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 6
 # Moves of the held positions cost HELD_BACK times as much after flips whose equilibria are not found, for these mostly
 # lie too far off, and LET_GO times less after flips that come true. Beyond MOST_DAMPING it is not for these moves.
 HELD_BACK, LET_GO, MOST_DAMPING = 10.0, 3.0, 1e3
@@ -102,8 +104,8 @@ def polish_labels(
             found = influence(equilibria, design, tets, plain, int(MOST_CANDIDATES * finer)).damped(damping)
         flipped = settings.printable(flip(problem, found, smp, smp, settings, price, STEPS, seed))
         changed = (flipped != smp)[found.tets]
-        settled = found.after(changed)
-        if settled.squared >= (1 - LEAST_ROUND_GAIN) * found.after(np.zeros_like(changed)).squared:
+        settled, unchanged = found.after(changed), found.after(np.zeros_like(changed))
+        if settled.squared >= (1 - LEAST_ROUND_GAIN) * unchanged.squared:
             price, poor = price / DEARER, poor + 1
             continue
         ahead = None if _too_far(settled.moves) else found.ahead(changed, settled.moves)
@@ -117,8 +119,9 @@ def polish_labels(
         far = rms <= settings.tolerance and _rounds_to_go(rms, new_rms, settings.target_rms) > MOST_TO_GO
         poor = poor + 1 if far or new > (1 - LEAST_ROUND_GAIN) * value else 0
         if new < value:
+            won = (value - new) * plain.error_scale**2 / (unchanged.squared - settled.squared)
+            price, damping = price * _price_change(won), max(damping / LET_GO, 1.0)
             design, value, found = fitted, new, None
-            price, damping = price / CHEAPER, max(damping / LET_GO, 1.0)
             watch(Search(equilibria, design))
         else:
             view, moves = found.view, _moves(equilibria, design, trial)
@@ -126,6 +129,13 @@ def polish_labels(
             limits = view.limits.at(trial.median) - moves @ view.limits_by_held
             found, price = found.taught(changed, shape, limits), DEARER * price
     return refit(equilibria, design, weights, watch) if design is not start else start
+
+
+def _price_change(won: float) -> float:
+    """The factor of the price after a round that won this share of what it promised."""
+    if won >= CAME_TRUE:
+        return 1 / CHEAPER
+    return 1.0 if won >= CAME_TO_LITTLE else DEARER
 
 
 def _rounds_to_go(before: float, after: float, target: float) -> float:

@@ -21,7 +21,7 @@ from fab4d.design.flips import (
     polish_labels,
 )
 from fab4d.design.gauss_newton import Ahead, Design, equilibrate, held_positions
-from fab4d.design.influence import FlipEnergy, Influence, influence
+from fab4d.design.influence import FlipEnergy, Influence, Settled, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import refit
@@ -131,7 +131,7 @@ def test_flips_become_cheaper_where_rounds_come_true_or_promise_nothing(monkeypa
     equilibria, energies = two_patches(problem), list[FlipEnergy]()
     design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
     settings = replace(recording(freely(problem), energies), rounds=3)
-    values = iter(np.geomspace(1.0, 0.1, 10))
+    values = iter(np.geomspace(1e12, 1e6, 10))
     monkeypatch.setattr(flips, "evaluate", lambda *_: next(values))
     monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
     polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
@@ -144,6 +144,38 @@ def test_flips_become_cheaper_where_rounds_come_true_or_promise_nothing(monkeypa
     assert len(energies) == flips.MOST_POOR
     for before, after in itertools.pairwise(energies):
         assert relative(before) == pytest.approx(flips.DEARER * relative(after))
+
+
+@pytest.mark.parametrize(
+    ("won", "change"), [(0.9, 1 / flips.CHEAPER), (0.61, 1 / flips.CHEAPER), (0.59, 1.0), (0.31, 1.0), (0.29, 3.0)]
+)
+def test_the_price_follows_what_rounds_win_of_what_they_promise(
+    monkeypatch: pytest.MonkeyPatch, won: float, change: float
+) -> None:
+    problem = bar(degrees=30.0)
+    equilibria, energies, promised = two_patches(problem), list[FlipEnergy](), list[float]()
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    settle = Influence.after
+
+    def after(self: Influence, flipped: np.ndarray) -> Settled:
+        settled = settle(self, flipped)
+        if len(energies) == 1:
+            promised.append(settled.squared)
+        return settled
+
+    def evaluate(*_: object) -> float:
+        if not promised:
+            return 1.0
+        unchanged, changed = max(promised), min(promised)
+        return 1.0 - won * (unchanged - changed) / WEIGHTS.error_scale**2
+
+    monkeypatch.setattr(Influence, "after", after)
+    monkeypatch.setattr(flips, "evaluate", evaluate)
+    monkeypatch.setattr(flips, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+    settings = replace(recording(freely(problem), energies), rounds=2)
+    polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
+    first, second = energies
+    assert relative(second) == pytest.approx(change * relative(first))
 
 
 def test_where_the_error_is_low_the_first_poor_round_ends_it() -> None:
