@@ -45,8 +45,6 @@ LOW_ERROR = 0.15
 WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
-# An error of printed labels up to this multiple of the predicted one has come true.
-COMES_TRUE = 1.5
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
 Polish = Callable[[Design], Design]
@@ -143,19 +141,19 @@ def _ways(
     """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
 
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
-    changes. Once a prediction has come true, labels that are predicted to be no better are left out.
+    changes. What is predicted to be no better than what was found is left out.
     """
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
-    came_true = np.inf
+    best = np.inf
     for labels in _repairs(equilibria.problem, flips, rounded, smp, settings):
         left = -np.inf if flips is None else error_left(flips, rounded, labels)
-        if left >= came_true or any((labels == other).all() for other in tried):
+        if left >= best or any((labels == other).all() for other in tried):
             continue
         tried.append(labels)
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
-        if followed is not None and shape_error(equilibria.problem, followed.fitted.final.y).rms <= COMES_TRUE * left:
-            came_true = left
+        if followed is not None:
+            best = min(best, shape_error(equilibria.problem, followed.fitted.final.y).rms)
         yield followed
 
 

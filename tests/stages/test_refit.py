@@ -185,6 +185,7 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
     settings = replace(settings, printable=lambda smp: smp)
     enough, never = replace(settings, target_rms=1.0), replace(settings, target_rms=0.0)
     monkeypatch.setattr(refit, "compensated", lambda problem, flips, before, smp, settings: smp)  # noqa: ARG005
+    monkeypatch.setattr(refit, "error_left", lambda *_: 0.0)  # all promise enough
     labels = [inputs["rounded"]["smp"], inputs["rounded"]["smp"].copy()]
     labels[1][np.flatnonzero(at_interface(problem, labels[0]))[::2]] ^= True
     made = [refit._printed_design(equilibria, inputs["relaxed"], smp, weights, enough) for smp in labels]
@@ -241,11 +242,11 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
         assert all(np.array_equal(got, way) for got, way in zip(tried, ways, strict=True))
 
 
-@pytest.mark.parametrize(("comes_true", "ways"), [(1.4, [0, 2]), (1.6, [0, 1, 2])])
-def test_labels_that_are_predicted_to_be_no_better_than_what_came_true_are_not_followed(
-    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, comes_true: float, ways: list[int]
+@pytest.mark.parametrize(("promise", "ways"), [(1.01, [0, 2]), (0.99, [0, 1, 2])])
+def test_labels_that_are_predicted_to_be_no_better_than_what_was_found_are_not_followed(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, promise: float, ways: list[int]
 ) -> None:
-    """The second are predicted to be worse than the first, the third to be better."""
+    """The second promise as much as the first have come to, or a little more; the third half of it."""
     equilibria, weights, settings = fit_of(inputs)
     smp = inputs["rounded"]["smp"]
     labels = [smp.copy(), smp, smp.copy()]
@@ -253,7 +254,7 @@ def test_labels_that_are_predicted_to_be_no_better_than_what_came_true_are_not_f
         labels[k][np.flatnonzero(at_interface(equilibria.problem, smp))[k]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
     printed = refit._Printed(before, before)
-    predicted_rms = rms(equilibria.problem, before) / comes_true * np.array([1.0, 1.1, 0.9])
+    predicted_rms = rms(equilibria.problem, before) * np.array([0.1, promise, 0.5])
     tried: list[int] = []
 
     def number(some: BoolArray) -> int:
