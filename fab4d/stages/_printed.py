@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.finish import carried_in
-from fab4d.design.flips import polish_labels
 from fab4d.design.forward import program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.paths import change_density
+from fab4d.design.polish import polish_labels
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, refit
 from fab4d.errors import EquilibriumError

@@ -8,13 +8,14 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, error_left, mended, polish_labels, predicted
+from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, error_left, mended, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design
 from fab4d.design.influence import Influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.paths import change_density, follow_density
+from fab4d.design.polish import polish_labels
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, polished, refit
 from fab4d.errors import EquilibriumError
