@@ -7,13 +7,17 @@ import pytest
 from bars import bar, held_design, two_patches
 from labelling import WEIGHTS, at_all_tets, freely, recording, upper_half
 
+from fab4d.design import flips
 from fab4d.design.flips import (
+    HELD_BACK,
     at_interface,
     compensated,
     error_left,
     flip,
     mended,
     near_interface,
+    predicted,
+    too_far,
 )
 from fab4d.design.gauss_newton import equilibrate, held_positions
 from fab4d.design.influence import FlipEnergy
@@ -95,3 +99,17 @@ def test_near_the_interface_are_tets_with_an_edge_of_its_tets() -> None:
     expected = [len(vertices & set(tet)) >= 2 for tet in corners.tolist()]
     np.testing.assert_array_equal(near_interface(problem, smp), expected)
     assert 0 < np.mean(expected) < 1
+
+
+def test_predicted_moves_are_held_back_until_none_is_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And no more than that: by one step of the damping less, one of them would be."""
+    problem = bar(cells=(6, 3, 2), degrees=40.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    found = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp))
+    free = float(np.abs(predicted(found, smp, ~smp).moves).max())
+    monkeypatch.setattr(flips, "LARGEST_MOVE", 0.1 * free)
+    assert 0 < np.abs(predicted(found, smp, ~smp).moves).max() <= 0.1 * free
+    factor = next(k for k in range(20) if not too_far(found.damped(HELD_BACK**k).after(~smp | smp).moves))
+    np.testing.assert_allclose(
+        predicted(found, smp, ~smp).moves.ravel(), found.damped(HELD_BACK**factor).after(~smp | smp).moves
+    )

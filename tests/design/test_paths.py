@@ -180,6 +180,22 @@ def test_what_fails_is_tried_with_half_of_it_and_more_damping(start: Start, monk
     assert [each.rho[0] for each in models] == [0.5, 0.75]
 
 
+def test_steps_of_models_come_down_to_a_part_of_the_smallest(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    equilibria, design = start
+    n, tried = equilibria.problem.n_tets, list[float]()
+    half = Design(np.full(n, 0.5), design.median, design.final)
+    monkeypatch.setattr(paths, "_at_once", lambda *_: (half, 0.5))
+    monkeypatch.setattr(paths, "build_model", lambda *_: None)
+    monkeypatch.setattr(paths, "prescribed_step", lambda *given: tried.append(float(given[3][0])))
+    monkeypatch.setattr(paths, "equilibrate", lambda *_, **__: None)
+    none = np.zeros_like(design.final.y)
+    ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
+    with pytest.raises(EquilibriumError):
+        follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead, 0.25)
+    np.testing.assert_allclose(np.array(tried) - 0.5, [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32])
+    assert tried[-1] - 0.5 == 0.25 / paths.FINER
+
+
 def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     equilibria, design = start
     monkeypatch.setattr(paths, "equilibrate", lambda *_, **__: None)

@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,6 +89,42 @@ def test_flips_become_dearer_where_they_have_no_equilibrium(monkeypatch: pytest.
         assert relative(after) == pytest.approx(polish.DEARER * relative(before))
         # What held positions make up for less is left of the error.
         assert np.linalg.norm(after.error) > np.linalg.norm(before.error)
+
+
+def test_flips_whose_held_positions_would_move_too_far_are_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = bar(degrees=30.0)
+    equilibria = two_patches(problem)
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    monkeypatch.setattr(flips, "LARGEST_MOVE", 0.0)
+    monkeypatch.setattr(polish, "follow_density", lambda *_: pytest.fail("they are followed"))
+    same = polish_labels(equilibria, design, WEIGHTS, freely(problem), lambda at: None)  # noqa: ARG005
+    assert same is design
+
+
+def test_held_positions_are_let_go_again_after_flips_that_come_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first round finds no equilibrium, the next two do."""
+    problem = bar(degrees=30.0)
+    equilibria, factors, follow = two_patches(problem), list[float](), polish.follow_density
+    design = held_design(equilibria, upper_half(problem).astype(float), problem.X_temp)
+    damped, values, rounds = Influence.damped, iter(np.geomspace(1e12, 1e6, 10)), itertools.count()
+
+    def hold_back(self: Influence, factor: float) -> Influence:
+        factors.append(factor)
+        return damped(self, factor)
+
+    def followed(*given: Any) -> Design:
+        if next(rounds) == 0:
+            raise EquilibriumError
+        return follow(*given)
+
+    monkeypatch.setattr(Influence, "damped", hold_back)
+    monkeypatch.setattr(polish, "follow_density", followed)
+    monkeypatch.setattr(polish, "evaluate", lambda *_: next(values))
+    monkeypatch.setattr(polish, "refit", lambda at, trial, *rest, **named: trial)  # noqa: ARG005
+    settings = replace(freely(problem), rounds=4)
+    polish_labels(equilibria, design, WEIGHTS, settings, lambda at: None)  # noqa: ARG005
+    held_back = HELD_BACK / polish.LET_GO
+    assert factors == pytest.approx([1.0, HELD_BACK, held_back, held_back / polish.LET_GO])
 
 
 def test_flips_become_cheaper_where_rounds_come_true_or_promise_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
