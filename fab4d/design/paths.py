@@ -54,8 +54,7 @@ def follow_density(
     Raises EquilibriumError when the path ends before.
     """
     design, done = _at_once(equilibria, design, rho, ahead, smallest)
-    if done > 0.0:
-        design, done = _along(design, done, _by_models(equilibria, rho, weights), smallest / FINER)
+    design, done = _along(design, done, _by_models(equilibria, rho, weights), smallest / FINER)
     held = held_positions(equilibria, design.median) + (1.0 - done) * ahead.moves
     return _arrived(*_along(design, done, _by_unloading(equilibria, rho, held, stay=True), smallest))
 

@@ -120,7 +120,9 @@ def test_held_positions_follow_so_that_the_error_stays_low(start: Start, monkeyp
     assert moved - fitted < 0.2 * (unmoved - fitted)
 
 
-@pytest.mark.parametrize(("predicted_to", "by_models_to"), [(1.0, 1.0), (0.5, 1.0), (0.5, 0.75), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("predicted_to", "by_models_to"), [(1.0, 1.0), (0.5, 1.0), (0.5, 0.75), (0.0, 1.0), (0.0, 0.0)]
+)
 def test_models_lead_on_from_what_is_predicted_and_unloading_from_there(
     start: Start, monkeypatch: pytest.MonkeyPatch, predicted_to: float, by_models_to: float
 ) -> None:
@@ -198,7 +200,8 @@ def test_steps_of_models_come_down_to_a_part_of_the_smallest(start: Start, monke
 
 def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     equilibria, design = start
-    monkeypatch.setattr(paths, "equilibrate", lambda *_, **__: None)
+    for step in ("equilibrate", "prescribed_step"):
+        monkeypatch.setattr(paths, step, lambda *_, **__: None)
     none = np.zeros_like(design.final.y)
     ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
