@@ -77,10 +77,10 @@ def polish_labels(
         rms = shape_error(problem, at.design.final.y).rms
         if rms <= settings.target_rms or at.poor >= _most_poor(settings, rms):
             break
-        found = at.found or _influence(equilibria, plain, at)
-        if found is None:
+        at = _informed(equilibria, plain, at)
+        if at.found is None:
             break
-        after = _after_round(equilibria, plain, settings, at, found, rms, seed)
+        after = _after_round(equilibria, plain, settings, at, at.found, rms, seed)
         if after.design is not at.design:
             watch(Search(equilibria, after.design))
         at = after
@@ -150,14 +150,14 @@ def _price_change(won: float) -> float:
     return 1.0 if won >= CAME_TO_LITTLE else DEARER
 
 
-def _influence(equilibria: Equilibria, plain: ObjectiveWeights, at: _Labels) -> Influence | None:
-    """What flips near the interface do; None where there is none."""
+def _informed(equilibria: Equilibria, plain: ObjectiveWeights, at: _Labels) -> _Labels:
+    """The same knowing what flips near the interface do, if there is one."""
     problem = equilibria.problem
     tets = np.flatnonzero(near_interface(problem, at.design.rho > 0.5))
-    if not tets.size:
-        return None
+    if at.found is not None or not tets.size:
+        return at
     most = int(MOST_CANDIDATES * fineness(problem))
-    return influence(equilibria, at.design, tets, plain, most).damped(at.damping)
+    return replace(at, found=influence(equilibria, at.design, tets, plain, most).damped(at.damping))
 
 
 def _changed(
