@@ -24,8 +24,6 @@ STEPS, FEW_STEPS = 2000, 300
 USUAL_TETS = 5_000
 # Moves of held positions that would go too far are made so many times dearer.
 HELD_BACK = 10.0
-# Labels whose equilibria are farther away than steps of this share of the change go are given up.
-SMALLEST_STEP = 0.25
 
 Printable = Callable[[BoolArray], BoolArray]
 # Labels (m,) of least energy near given ones, by the share of the volume that may become SMP, steps and a seed.

@@ -92,6 +92,8 @@ TRIAL_ITERATIONS = 8
 ASTRAY_ITERATIONS = 20
 # The equilibria of a step are sought from where it is predicted to lead, or from the first of these shares of the way.
 SHARES_OF_CHANGE = (1.0, 0.5, 0.25, 0.125)
+# Damping of the first step where nothing is known of it.
+FIRST_DAMPING = 0.3
 # Damping falls by the first factor after a step that was taken at once, and rises by the second after one that was not:
 # a step that fails costs more than one that is held back a little.
 SOFTER, STIFFER = 3.0, 5.0

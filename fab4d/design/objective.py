@@ -44,6 +44,10 @@ class ObjectiveWeights:
         """The same with other numbers."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
+    def of_fixed_density(self) -> "ObjectiveWeights":
+        """The same without the terms that the density alone decides."""
+        return self.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
+
 
 # A rig that only pulls is asked for this share of the usual force out of the surface: a penalty gives way a little.
 PULL_MARGIN = 0.05

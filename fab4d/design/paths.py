@@ -6,6 +6,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import (
+    FIRST_DAMPING,
     STIFFER,
     Ahead,
     Design,
@@ -22,10 +23,10 @@ from fab4d.mesh.tetmesh import FloatArray
 
 # So many steps lead on before a longer one is tried: one that failed fails mostly again.
 BEFORE_LONGER = 3
+# Labels whose equilibria are farther away than steps of this share of the change go are given up.
+SMALLEST_STEP = 0.25
 # Steps that held positions follow may be so many times shorter: they are quicker, and keep the error low.
 FINER = 8.0
-# Damping of the held positions in the first try of such a step.
-FIRST_DAMPING = 0.3
 
 # A design and the share of the rest of the way -> the design there, None where no equilibrium is found.
 Lead = Callable[[Design, float], Design | None]
@@ -44,27 +45,25 @@ def change_density(
 
 
 def follow_density(
-    equilibria: Equilibria, design: Design, rho: FloatArray, weights: ObjectiveWeights, ahead: Ahead, smallest: float
+    equilibria: Equilibria, design: Design, rho: FloatArray, weights: ObjectiveWeights, ahead: Ahead
 ) -> Design:
     """The design with density rho (m,), and held positions that follow it so that the objective stays low.
 
     ahead : what the change does, held positions that move along included
     As far as that leads at once; then by linear models, made anew in each step. Unloading, which takes longer, leads on
-    where these come to nothing. A step ends at unstable states. smallest : see `change_density`
+    where these come to nothing. A step ends at unstable states.
     Raises EquilibriumError when the path ends before.
     """
-    design, done = _at_once(equilibria, design, rho, ahead, smallest)
-    design, done = _along(design, done, _by_models(equilibria, rho, weights), smallest / FINER)
+    design, done = _at_once(equilibria, design, rho, ahead)
+    design, done = _along(design, done, _by_models(equilibria, rho, weights), SMALLEST_STEP / FINER)
     held = held_positions(equilibria, design.median) + (1.0 - done) * ahead.moves
-    return _arrived(*_along(design, done, _by_unloading(equilibria, rho, held, stay=True), smallest))
+    return _arrived(*_along(design, done, _by_unloading(equilibria, rho, held, stay=True), SMALLEST_STEP))
 
 
-def _at_once(
-    equilibria: Equilibria, design: Design, rho: FloatArray, ahead: Ahead, smallest: float
-) -> tuple[Design, float]:
+def _at_once(equilibria: Equilibria, design: Design, rho: FloatArray, ahead: Ahead) -> tuple[Design, float]:
     """The farthest design that is found where `ahead` has it, and its share of the way."""
     held, share = held_positions(equilibria, design.median), 1.0
-    while share >= smallest:
+    while share >= SMALLEST_STEP:
         mixed, part = _between(design.rho, rho, share), ahead.part(share)
         guess = guessed(equilibria, design, mixed, part)
         found = equilibrate(equilibria, mixed, held + part.moves, *guess, stay=True)

@@ -10,16 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.flips import (
-    HELD_BACK,
-    SMALLEST_STEP,
-    STEPS,
-    FlipSettings,
-    fineness,
-    flip,
-    near_interface,
-    too_far,
-)
+from fab4d.design.flips import HELD_BACK, STEPS, FlipSettings, fineness, flip, near_interface, too_far
 from fab4d.design.gauss_newton import Ahead, Design, evaluate, held_positions
 from fab4d.design.influence import Influence, influence
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
@@ -71,7 +62,7 @@ def polish_labels(
 
     design : of 0/1 labels, held positions fitted to them; the result is such a design too
     """
-    problem, plain = equilibria.problem, _without_density_terms(weights)
+    problem, plain = equilibria.problem, weights.of_fixed_density()
     at = _Labels(design, _objective(equilibria, plain, design), FIRST_PRICE / fineness(problem))
     for seed in range(settings.rounds):
         rms = shape_error(problem, at.design.final.y).rms
@@ -114,15 +105,10 @@ def _after_round(
     far = rms <= settings.tolerance and _rounds_to_go(rms, new_rms, settings.target_rms) > MOST_TO_GO
     poor = at.poor + 1 if far or value > (1 - LEAST_ROUND_GAIN) * at.value else 0
     if value >= at.value:
-        return replace(
-            at, found=_taught(equilibria, at.design, trial, found, changed), price=DEARER * at.price, poor=poor
-        )
+        taught = _taught(equilibria, at.design, trial, found, changed)
+        return replace(at, found=taught, price=DEARER * at.price, poor=poor)
     won = (at.value - value) * plain.error_scale**2 / promised
     return _Labels(fitted, value, at.price * _price_change(won), max(at.damping / LET_GO, 1.0), poor)
-
-
-def _without_density_terms(weights: ObjectiveWeights) -> ObjectiveWeights:
-    return weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
 
 
 def _objective(equilibria: Equilibria, weights: ObjectiveWeights, design: Design) -> float:
@@ -152,9 +138,11 @@ def _price_change(won: float) -> float:
 
 def _informed(equilibria: Equilibria, plain: ObjectiveWeights, at: _Labels) -> _Labels:
     """The same knowing what flips near the interface do, if there is one."""
+    if at.found is not None:
+        return at
     problem = equilibria.problem
     tets = np.flatnonzero(near_interface(problem, at.design.rho > 0.5))
-    if at.found is not None or not tets.size:
+    if not tets.size:
         return at
     most = int(MOST_CANDIDATES * fineness(problem))
     return replace(at, found=influence(equilibria, at.design, tets, plain, most).damped(at.damping))
@@ -165,7 +153,7 @@ def _changed(
 ) -> Design | None:
     """The design with these labels (m,), held positions following; None where it has no stable equilibrium near."""
     try:
-        return follow_density(equilibria, design, labels.astype(np.float64), weights, ahead, SMALLEST_STEP)
+        return follow_density(equilibria, design, labels.astype(np.float64), weights, ahead)
     except EquilibriumError:
         return None
 

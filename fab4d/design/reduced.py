@@ -10,7 +10,14 @@ from scipy.sparse import csr_array
 from fab4d.design.equilibria import Equilibria, Final, Median
 from fab4d.design.exchange import exchanged
 from fab4d.design.forward import load
-from fab4d.design.gauss_newton import Design, build_model, evaluate, gauss_newton_step, held_positions
+from fab4d.design.gauss_newton import (
+    FIRST_DAMPING,
+    Design,
+    build_model,
+    evaluate,
+    gauss_newton_step,
+    held_positions,
+)
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
 from fab4d.design.paths import change_density
@@ -21,7 +28,7 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 START_DENSITY = 0.6
 UNDECIDED = (1e-3, 1 - 1e-3)
-FIRST_DAMPING, LARGEST_DAMPING = 0.3, 30.0
+LARGEST_DAMPING = 30.0
 FIRST_LAM_ROUND = 0.02
 # Points are exchanged after this many relaxed steps, so many times at most, and not where the error is below this share
 # of the tolerance.
@@ -383,7 +390,7 @@ def refit(
 ) -> Design:
     """Held positions that are best for the design's fixed density; the density does not move."""
     problem = equilibria.problem
-    weights = weights.replace(lam_SMP=0.0, lam_mat=0.0, lam_round=0.0, lam_smooth=0.0)
+    weights = weights.of_fixed_density()
     L = smoothness_matrix(problem)
     fixed = np.zeros(problem.n_tets, bool)
     damping, value = FIRST_DAMPING, evaluate(equilibria, weights, L, design)

@@ -8,13 +8,13 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import carried_over
-from fab4d.design.flips import SMALLEST_STEP, FlipSettings, compensated, error_left, mended, predicted
+from fab4d.design.flips import FlipSettings, compensated, error_left, mended, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design
 from fab4d.design.influence import Influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import Patches, outward_normals
-from fab4d.design.paths import change_density, follow_density
+from fab4d.design.paths import SMALLEST_STEP, change_density, follow_density
 from fab4d.design.polish import polish_labels
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search, polished, refit
@@ -185,7 +185,7 @@ def _followed(
     rho = smp.astype(np.float64)
     try:
         if ahead is not None:
-            design = follow_density(equilibria, before, rho, weights, ahead, SMALLEST_STEP)
+            design = follow_density(equilibria, before, rho, weights, ahead)
         else:
             smallest = PATIENT_STEP if patient else SMALLEST_STEP
             design = change_density(equilibria, before, rho, smallest, stay=not patient)

@@ -96,7 +96,7 @@ def test_held_positions_move_as_predicted_where_that_leads_all_the_way(start: St
     equilibria, design = start
     labels = other_labels(equilibria, design)
     ahead, rho = ahead_of(equilibria, design, labels), labels.astype(float)
-    found = follow_density(equilibria, design, rho, WEIGHTS, ahead, 0.25)
+    found = follow_density(equilibria, design, rho, WEIGHTS, ahead)
     np.testing.assert_array_equal(found.rho, rho)
     moves = held_positions(equilibria, found.median) - held_positions(equilibria, design.median)
     np.testing.assert_allclose(moves, ahead.moves, atol=1e-6)
@@ -109,7 +109,7 @@ def test_held_positions_follow_so_that_the_error_stays_low(start: Start, monkeyp
     ahead, rho = ahead_of(equilibria, design, labels), labels.astype(float)
     half = change_density(equilibria, design, 0.5 * (design.rho + rho))
     monkeypatch.setattr(paths, "_at_once", lambda *_: (half, 0.5))
-    found = follow_density(equilibria, design, rho, WEIGHTS, ahead, 0.25)
+    found = follow_density(equilibria, design, rho, WEIGHTS, ahead)
     np.testing.assert_array_equal(found.rho, rho)
     assert balance(equilibria, rho, found.median, found.final).final < 1e-5
     still = change_density(equilibria, design, rho)
@@ -154,7 +154,7 @@ def test_models_lead_on_from_what_is_predicted_and_unloading_from_there(
     monkeypatch.setattr(paths, "prescribed_step", lambda *given: led("model", given[3], by_models_to))
     none = np.zeros_like(design.final.y)
     ahead = Ahead(moves, none, np.zeros_like(moves), none)
-    found = follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead, 0.25)
+    found = follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     np.testing.assert_array_equal(found.rho, 1.0)
     expected = [("predicted", predicted_to), ("model", by_models_to), ("unloading", 1.0)]
     reached = [0.0, predicted_to, by_models_to]
@@ -176,7 +176,7 @@ def test_what_fails_is_tried_with_half_of_it_and_more_damping(start: Start, monk
     monkeypatch.setattr(paths, "prescribed_step", step)
     none = np.zeros_like(design.final.y)
     ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
-    follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead, 0.25)
+    follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     first = paths.FIRST_DAMPING
     np.testing.assert_allclose(tried, [(1.0, first), (0.75, paths.STIFFER * first), (1.0, first)])
     assert [each.rho[0] for each in models] == [0.5, 0.75]
@@ -193,9 +193,9 @@ def test_steps_of_models_come_down_to_a_part_of_the_smallest(start: Start, monke
     none = np.zeros_like(design.final.y)
     ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
     with pytest.raises(EquilibriumError):
-        follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead, 0.25)
+        follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     np.testing.assert_allclose(np.array(tried) - 0.5, [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32])
-    assert tried[-1] - 0.5 == 0.25 / paths.FINER
+    assert tried[-1] - 0.5 == paths.SMALLEST_STEP / paths.FINER
 
 
 def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,6 +205,6 @@ def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.Mo
     none = np.zeros_like(design.final.y)
     ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
-        follow_density(equilibria, design, 1 - design.rho, WEIGHTS, ahead, 0.25)
+        follow_density(equilibria, design, 1 - design.rho, WEIGHTS, ahead)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
         change_density(equilibria, design, 1 - design.rho)
