@@ -28,6 +28,9 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 SEARCH_TOLERANCE = 1e-6
 # That of the states on the way of unloading, which only serve to guess the next.
 UNLOADING_TOLERANCE = 1e-2
+# The guess of a final shape follows its median shape by linear maps, unless that moves farther than this, in L0; then
+# it moves as far.
+FOLLOWED_FAR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +45,20 @@ class Design:
 @dataclass(frozen=True, eq=False)
 class Ahead:
     """Where linear algebra has the equilibria after a change: moves (K, 3) of the held positions, and what they and the
-    change of the density do to x (N, 3), f (K, 3) and y (N, 3)."""
+    change of the density do to x (N, 3), f (K, 3) and y (N, 3).
+
+    near : the linear maps that tell
+    """
 
     moves: FloatArray
     x: FloatArray
     f: FloatArray
     y: FloatArray
+    near: Linearisation
 
     def part(self, share: float) -> "Ahead":
         """That of a share of the change."""
-        return Ahead(share * self.moves, share * self.x, share * self.f, share * self.y)
+        return Ahead(share * self.moves, share * self.x, share * self.f, share * self.y, self.near)
 
 
 def equilibrate(
@@ -69,7 +76,7 @@ def equilibrate(
 ) -> Design | None:
     """The design of rho and held positions from the guesses x, forces, y; None where an equilibrium is not found.
 
-    Where the median shape is found moves from its guess, the guess of the final shape moves along: what stiff SMP has
+    Where the median shape is found moves from its guess, the guess of the final shape follows: what stiff SMP has
     frozen would else be bent in it. near : about a design near this one
     by_unloading : whether a final shape that is not found from its guess is looked for where unloading ends, which
         costs three times as much and leads to labels whose final shape lies far from those before
@@ -78,8 +85,9 @@ def equilibrate(
     median = equilibria.solve_median(rho, held, x, forces, tolerance, max_iterations, stay=stay, near=hot)
     if not median.solution.converged:
         return None
-    turning = equilibria.free_turning
-    y = _ahead(turning.step, y, median.x - x, lambda y: equilibria.final_gradient(rho, median, y)[1])
+    moved = median.x - x
+    follow = moved if near is None or np.abs(moved).max() > FOLLOWED_FAR else near.final_follows(moved)
+    y = _ahead(equilibria.free_turning.step, y, follow, lambda y: equilibria.final_gradient(rho, median, y)[1])
     final = equilibria.solve_final(rho, median, y, tolerance, max_iterations, stay=stay, near=cold)
     if by_unloading and not final.solution.converged:
         final, _, unloaded = unload(equilibria, rho, median, UNLOADING_TOLERANCE, tolerance, stay)
@@ -347,7 +355,7 @@ def _trial(
     if max(np.abs(dx).max(), np.abs(dy).max()) > LARGEST_MOVE:
         return None
     held = held_positions(equilibria, design.median) + dc
-    guess = guessed(equilibria, design, rho, Ahead(dc, dx, df, dy))
+    guess = guessed(equilibria, design, rho, Ahead(dc, dx, df, dy, model.lin))
     most = TRIAL_ITERATIONS if stay else ASTRAY_ITERATIONS
     return equilibrate(equilibria, rho, held, *guess, max_iterations=most, stay=stay, near=model.lin)
 

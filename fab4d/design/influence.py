@@ -206,8 +206,8 @@ class Influence:
         n = loads.hot.shape[0]
         hot = -np.concatenate([loads.hot.sum(axis=1), moves])
         z, dy = self.lin.respond(hot[:, None], -loads.cold.sum(axis=1)[:, None])
-        dx, df = z[:n], z[n:]
-        return Ahead(*(each.reshape(-1, 3) for each in (moves, dx, df, dy)))
+        dc, dx, df, dy = (each.reshape(-1, 3) for each in (moves, z[:n], z[n:], dy))
+        return Ahead(dc, dx, df, dy, self.lin)
 
     def damped(self, factor: float) -> "Influence":
         """The same with moves of the held positions that cost so many times as much."""

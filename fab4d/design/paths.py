@@ -66,7 +66,7 @@ def _at_once(equilibria: Equilibria, design: Design, rho: FloatArray, ahead: Ahe
     while share >= SMALLEST_STEP:
         mixed, part = _between(design.rho, rho, share), ahead.part(share)
         guess = guessed(equilibria, design, mixed, part)
-        found = equilibrate(equilibria, mixed, held + part.moves, *guess, stay=True)
+        found = equilibrate(equilibria, mixed, held + part.moves, *guess, stay=True, near=ahead.near)
         if found is not None:
             return found, share
         share /= 2

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median, Pinned
 from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate, held_positions
 from fab4d.design.objective import shape_error, shape_metric
-from fab4d.design.sensitivity import linearise
+from fab4d.design.sensitivity import Linearisation
 from fab4d.design.turning import Turning
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
-from fab4d.solvers.linear import SingularMatrixError
+from fab4d.solvers.linear import Factor, SingularMatrixError
 
 PHASES = ("tpe", "rubbery", "glassy")
 NEWTON_STEPS = 25
@@ -79,10 +79,9 @@ class Response:
         return _least_moves(self.df_dc, change)
 
 
-def response_of(equilibria: Equilibria, design: Design) -> Response:
-    """Linearise both equilibria of the design in its held positions. Raises SingularMatrixError."""
+def response_of(equilibria: Equilibria, design: Design, lin: Linearisation) -> Response:
+    """How the design, with the linear maps `lin` about it, responds to moves of its held positions."""
     problem, y = equilibria.problem, design.final.y
-    lin = linearise(equilibria, design.rho, design.median, design.final)
     dx_dc, df_dc, dy_dc = lin.held_columns()
     error = shape_error(problem, y)
     pull = (problem.area_weights[:, None] * (error.e @ error.R)).ravel()
@@ -132,31 +131,35 @@ def instability_of(response: Response) -> Instability:
     )
 
 
-# -- the changed design, in equilibrium
+# -- the changed design, in equilibrium; `near` are the linear maps about the design
 
 
-def with_moved_points(equilibria: Equilibria, design: Design, response: Response, dc: FloatArray) -> Design | None:
+def with_moved_points(
+    equilibria: Equilibria, design: Design, near: Linearisation, response: Response, dc: FloatArray
+) -> Design | None:
     """The design once its held positions have moved by dc (K, 3), L0; None where no equilibrium is found near it."""
     held, d = held_positions(equilibria, design.median) + dc, dc.ravel()
     x, f, y = design.median.x, design.median.forces, design.final.y
     dx, df, dy = (part.reshape(-1, 3) for part in (response.dx_dc @ d, response.df_dc @ d, response.dy_dc @ d))
     ahead = equilibria.held_turning.step(x, dx), f + df, equilibria.free_turning.step(y, dy)
     for guess in (ahead, (x, f, y)):
-        found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS)
+        found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS, near=near)
         if found is not None:
             return found
     return None
 
 
-def with_scaled_modulus(equilibria: Equilibria, design: Design, phase: str, factor: float) -> Design | None:
+def with_scaled_modulus(
+    equilibria: Equilibria, design: Design, near: Linearisation, phase: str, factor: float
+) -> Design | None:
     """The design at the same held positions with mu and kappa of one of PHASES times `factor`."""
     moduli: Moduli = getattr(equilibria.problem, phase)
     other = equilibria.with_moduli(**{phase: Moduli(factor * moduli.mu, factor * moduli.kappa)})
     held, x, f, y = held_positions(equilibria, design.median), design.median.x, design.median.forces, design.final.y
-    return equilibrate(other, design.rho, held, x, f, y, SEARCH_TOLERANCE, NEWTON_STEPS)
+    return equilibrate(other, design.rho, held, x, f, y, SEARCH_TOLERANCE, NEWTON_STEPS, near=near)
 
 
-def with_scaled_forces(equilibria: Equilibria, design: Design, factor: float) -> Design | None:
+def with_scaled_forces(equilibria: Equilibria, design: Design, near: Linearisation, factor: float) -> Design | None:
     """The design with `factor` times its forces; None where no path of equilibria leads there."""
     problem = equilibria.problem
     turning = Turning(problem.body, np.flatnonzero(problem.clamp), equilibria.operator[:0])
@@ -166,7 +169,7 @@ def with_scaled_forces(equilibria: Equilibria, design: Design, factor: float) ->
             wanted = (1 + share * (factor - 1)) * design.median.forces
             median = _median_of_forces(equilibria, turning, design.rho, median, wanted) if median else None
         if median is not None:
-            return _unloaded(equilibria, design, median)
+            return _unloaded(equilibria, design, near, median)
     return None
 
 
@@ -195,9 +198,10 @@ def _step_to_forces(
 ) -> tuple[Median, float] | None:
     """The median shape after a damped Newton step to the wanted forces (K, 3), and the damping of the next step."""
     n = median.x.size
-    columns = _held_columns(equilibria, rho, median)
-    if columns is None:
+    tangent = _stable_tangent(equilibria, rho, median)
+    if tangent is None:
         return None
+    columns = _held_columns(tangent, n, median.forces.size)
     dc = _least_moves(columns[n:], wanted - median.forces)
     size = float(np.linalg.norm(dc))
     damping = min(damping, LONGEST_MOVE / size)
@@ -206,7 +210,7 @@ def _step_to_forces(
         x = turning.step(median.x, dz[:n].reshape(-1, 3))
         f = median.forces + dz[n:].reshape(-1, 3)
         held = equilibria.patches.mean(x) + RIG_COMPLIANCE * f
-        trial = equilibria.solve_median(rho, held, x, f, SEARCH_TOLERANCE, FEW_NEWTON_STEPS)
+        trial = equilibria.solve_median(rho, held, x, f, SEARCH_TOLERANCE, FEW_NEWTON_STEPS, near=tangent)
         if not trial.solution.converged:
             damping /= 4
             continue
@@ -218,19 +222,20 @@ def _step_to_forces(
     return None
 
 
-def _held_columns(equilibria: Equilibria, rho: FloatArray, median: Median) -> FloatArray | None:
-    """(3N + 3K, 3K) derivatives of the median shape and of its forces with respect to the held positions.
-
-    None where the shape is not stable even with its points locked: the part would have snapped over on the way.
-    """
-    n, k = median.x.size, median.forces.size
-    rhs = np.zeros((n + k, k))
-    rhs[n + np.arange(k), np.arange(k)] = -1.0
+def _stable_tangent(equilibria: Equilibria, rho: FloatArray, median: Median) -> Factor | None:
+    """None where the shape is not stable even with its points locked: the part would have snapped over on the way."""
     try:
         tangent = equilibria.held_analysis.factor(equilibria.median_tangent(rho, median.x))
     except SingularMatrixError:
         return None
-    return tangent.solve_many(rhs) if tangent.n_negative == k else None
+    return tangent if tangent.n_negative == median.forces.size else None
+
+
+def _held_columns(tangent: Factor, n: int, k: int) -> FloatArray:
+    """(n + k, k) derivatives of the n positions of the median shape and of its k forces by the held positions."""
+    rhs = np.zeros((n + k, k))
+    rhs[n + np.arange(k), np.arange(k)] = -1.0
+    return tangent.solve_many(rhs)
 
 
 def _least_moves(df_dc: FloatArray, change: FloatArray) -> FloatArray:
@@ -239,11 +244,11 @@ def _least_moves(df_dc: FloatArray, change: FloatArray) -> FloatArray:
     return moves.reshape(-1, 3)
 
 
-def _unloaded(equilibria: Equilibria, design: Design, median: Median) -> Design | None:
+def _unloaded(equilibria: Equilibria, design: Design, near: Linearisation, median: Median) -> Design | None:
     """The design with another median shape."""
-    y = design.final.y
+    y, cold = design.final.y, Pinned(near.free, near.free_fixed)
     for guess in (y, y + median.x - design.median.x, median.x):
-        final = equilibria.solve_final(design.rho, median, guess, SEARCH_TOLERANCE, NEWTON_STEPS)
+        final = equilibria.solve_final(design.rho, median, guess, SEARCH_TOLERANCE, NEWTON_STEPS, near=cold)
         if final.solution.converged:
             return Design(design.rho, median, final)
     return None

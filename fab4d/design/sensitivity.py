@@ -86,6 +86,12 @@ class Linearisation:
         r[self.free_fixed] = 0.0
         return z[:n].reshape(-1, 3), z[n:].reshape(-1, 3), self.free.solve(r).reshape(-1, 3)
 
+    def final_follows(self, dx: FloatArray) -> FloatArray:
+        """dy (N, 3) of a change dx (N, 3) of the median shape."""
+        r = -(self.M @ dx.ravel())
+        r[self.free_fixed] = 0.0
+        return self.free.solve(r).reshape(-1, 3)
+
     def forward_rho(self, drho: FloatArray) -> Change:
         """What a change drho (m,) at fixed held positions changes."""
         n = self.M.shape[0]

@@ -1,6 +1,6 @@
 """Stage `sensitivity`: whether the verified state is stable, and how its error moves with rig and material."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -19,14 +19,16 @@ from fab4d.design.robustness import (
     with_scaled_forces,
     with_scaled_modulus,
 )
+from fab4d.design.sensitivity import Linearisation, linearise
 from fab4d.solvers.linear import SingularMatrixError
 from fab4d.solvers.threads import side_by_side
 from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages.monitor import Monitor
 
 HOLD_MM, FORCE_CHANGE, MODULUS_CHANGE = 1.0, 0.05, 0.1
-# Points whose worst move is simulated first. Where the quadratic model of the error is off by more than MODEL_ERROR
-# there, everything is simulated, random moves by so many that come in pairs of opposite ones.
+# The worst moves of points are simulated, the worst first, until the quadratic model of the error is off by MODEL_ERROR
+# at most for so many in a row: it is better for what moves less. Where it was off, random moves are simulated too, so
+# many that come in pairs of opposite ones.
 SIMULATED_POINTS, MODEL_ERROR, RANDOM_MOVES = 2, 0.2, 4
 ELEMENTS = {1: "linear", 2: "quadratic"}
 
@@ -42,17 +44,18 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     design = _verified_design(equilibria, inputs["labels"]["smp"].astype(np.float64), state)
     monitor.progress("stability")
     try:
-        response = response_of(equilibria, design)
+        lin = linearise(equilibria, design.rho, design.median, design.final)
     except SingularMatrixError as error:
         reason = f"the verified state is at the limit of its stability ({error}): allow more points ([goal] max_forces)"
         left_out = _left_out("the state has no stiffness in some direction")
         return {"sensitivity_report": left_out | {"stable": False, "reasons": [reason]}}
+    response = response_of(equilibria, design, lin)
     unstable = instability_of(response)
     reasons = _reasons(unstable)
     report = {"stable": not reasons, "instability": _instability_figures(unstable), "reasons": reasons}
     if reasons:
         return {"sensitivity_report": _left_out("the state is not stable") | report}
-    return {"sensitivity_report": report | _changes(equilibria, design, response, monitor) | {"left_out": []}}
+    return {"sensitivity_report": report | _changes(equilibria, design, lin, response, monitor) | {"left_out": []}}
 
 
 def _why_not(state: Mapping[str, Any], verify_report: Mapping[str, Any]) -> str | None:
@@ -100,14 +103,17 @@ def _instability_figures(unstable: Instability) -> dict[str, Any]:
 # -- changes
 
 
-def _changes(equilibria: Equilibria, design: Design, response: Response, monitor: Monitor) -> dict[str, Any]:
+def _changes(
+    equilibria: Equilibria, design: Design, lin: Linearisation, response: Response, monitor: Monitor
+) -> dict[str, Any]:
     L0 = equilibria.problem.length
     monitor.progress("positions", rms_mm=response.rms * L0)
-    hold = _hold_figures(equilibria, design, response)
+    hold = _hold_figures(equilibria, design, lin, response)
     monitor.progress("forces", rms_mm=response.rms * L0)
-    force = _force_figures(equilibria, design, response)
+    force = _force_figures(equilibria, design, lin, response)
     monitor.progress("moduli", rms_mm=response.rms * L0)
-    return {"rms_mm": response.rms * L0, "hold": hold, "force": force, "modulus": _modulus_figures(equilibria, design)}
+    modulus = _modulus_figures(equilibria, design, lin)
+    return {"rms_mm": response.rms * L0, "hold": hold, "force": force, "modulus": modulus}
 
 
 def _rms_mm(equilibria: Equilibria, design: Design | None) -> float | None:
@@ -117,36 +123,49 @@ def _rms_mm(equilibria: Equilibria, design: Design | None) -> float | None:
     return shape_error(equilibria.problem, design.final.y).rms * equilibria.problem.length
 
 
-def _hold_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
+def _hold_figures(equilibria: Equilibria, design: Design, lin: Linearisation, response: Response) -> dict[str, Any]:
     """Each point moved in its own worst direction; all points in random ones."""
     L0, count = equilibria.problem.length, equilibria.patches.count
     size, unknowns = HOLD_MM / L0, 3 * equilibria.problem.n_nodes
 
     def simulated(dc: np.ndarray) -> float | None:
-        return _rms_mm(equilibria, with_moved_points(equilibria, design, response, dc))
-
-    def all_simulated(some: np.ndarray) -> dict[int, float | None]:
-        found = side_by_side([partial(simulated, moves[k]) for k in some], unknowns)
-        return dict(zip(some.tolist(), found, strict=True))
+        return _rms_mm(equilibria, with_moved_points(equilibria, design, lin, response, dc))
 
     moves = [_alone(count, point, response.worst_move(point, size)) for point in range(count)]
-    told = [response.rms_after(dc) * L0 for dc in moves]
-    worst_first = np.argsort(told)[::-1]
-    found = all_simulated(worst_first[:SIMULATED_POINTS])
-    holds = all(rms is not None and abs(told[k] - rms) <= MODEL_ERROR * rms for k, rms in found.items())
+    told = np.array([response.rms_after(dc) * L0 for dc in moves])
+    found = simulated_points(told, lambda some: side_by_side([partial(simulated, moves[k]) for k in some], unknowns))
+    holds = all(_told_well(told[k], rms) for k, rms in found.items())
     random_model_rms = response.expected_rms(size) * L0
     random_rms: float | None = random_model_rms
     if not holds:
-        found |= all_simulated(worst_first[SIMULATED_POINTS:])
         random = [partial(simulated, dc) for dc in _random_moves(count, size)]
         random_rms = _root_mean_square(side_by_side(random, unknowns))
     points = [
-        {"point": k + 1, "direction": (moves[k][k] / size).tolist(), "model_rms_mm": told[k]}
+        {"point": k + 1, "direction": (moves[k][k] / size).tolist(), "model_rms_mm": float(told[k])}
         | {"simulated": k in found, "rms_mm": found.get(k)}
         for k in range(count)
     ]
     expected = {"random_rms_mm": random_rms, "random_model_rms_mm": random_model_rms}
     return {"change_mm": HOLD_MM, "model_holds": holds, **expected, "points": points}
+
+
+def simulated_points(told: np.ndarray, simulate: Callable[[list[int]], list[float | None]]) -> dict[int, float | None]:
+    """RMS errors, mm, of the points whose moves are worst, until the model tells SIMULATED_POINTS in a row well.
+
+    told (K,) : errors by the model        simulate : points -> errors, None where there is no equilibrium
+    """
+    found = dict[int, float | None]()
+    worst_first, well = np.argsort(-told, kind="stable").tolist(), 0
+    while worst_first and well < SIMULATED_POINTS:
+        some, worst_first = worst_first[:SIMULATED_POINTS], worst_first[SIMULATED_POINTS:]
+        for k, rms in zip(some, simulate(some), strict=True):
+            found[k] = rms
+            well = well + 1 if _told_well(told[k], rms) else 0
+    return found
+
+
+def _told_well(told: float, rms: float | None) -> bool:
+    return rms is not None and bool(abs(told - rms) <= MODEL_ERROR * rms)
 
 
 def _random_moves(count: int, size: float) -> list[np.ndarray]:
@@ -170,11 +189,11 @@ def _alone(count: int, point: int, change: np.ndarray) -> np.ndarray:
     return all_points
 
 
-def _force_figures(equilibria: Equilibria, design: Design, response: Response) -> dict[str, Any]:
+def _force_figures(equilibria: Equilibria, design: Design, lin: Linearisation, response: Response) -> dict[str, Any]:
     """All forces larger or smaller by the same part, simulated, and the force of each point alone, by the model."""
 
     def together(change: float) -> dict[str, float | None]:
-        simulated = _rms_mm(equilibria, with_scaled_forces(equilibria, design, 1 + change))
+        simulated = _rms_mm(equilibria, with_scaled_forces(equilibria, design, lin, 1 + change))
         return {**_by_model(response, change * design.median.forces, L0), "rms_mm": simulated}
 
     def alone(point: int) -> dict[str, float]:
@@ -195,12 +214,12 @@ def _by_model(response: Response, change: np.ndarray, L0: float) -> dict[str, fl
     return {"model_rms_mm": response.rms_after(dc) * L0, "model_travel_mm": travel * L0}
 
 
-def _modulus_figures(equilibria: Equilibria, design: Design) -> dict[str, Any]:
+def _modulus_figures(equilibria: Equilibria, design: Design, lin: Linearisation) -> dict[str, Any]:
     """Each phase softer and stiffer at the same held positions: error, and size of all forces relative to before."""
     before = np.linalg.norm(design.median.forces)
 
     def changed(phase: str, factor: float) -> dict[str, float | None]:
-        found = with_scaled_modulus(equilibria, design, phase, factor)
+        found = with_scaled_modulus(equilibria, design, lin, phase, factor)
         forces = None if found is None else float(np.linalg.norm(found.median.forces) / before)
         return {"rms_mm": _rms_mm(equilibria, found), "forces": forces}
 

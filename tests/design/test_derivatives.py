@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bars import TIGHT, bar, held_design, mixed_density, two_patches
 
-from fab4d.design.equilibria import Equilibria
-from fab4d.design.gauss_newton import Design, build_model, evaluate, held_positions
+from fab4d.design.equilibria import Equilibria, Final, Median
+from fab4d.design.gauss_newton import Design, build_model, equilibrate, evaluate, held_positions
 from fab4d.design.objective import ObjectiveWeights, density_terms, smoothness_matrix, squeeze, stretch_excess
 from fab4d.design.sensitivity import linearise
 
@@ -73,6 +73,43 @@ def test_held_columns_are_forward_of_each_held_coordinate(moved: Moved) -> None:
     lin = linearise(moved.equilibria, moved.at.rho, moved.at.median, moved.at.final)
     for column, forward in zip(lin.held_columns(), lin.forward(np.zeros_like(moved.drho), moved.dc), strict=True):
         np.testing.assert_allclose(column @ moved.dc.ravel(), forward.ravel(), atol=1e-10 * np.abs(forward).max())
+
+
+def test_the_final_shape_follows_the_median_shape_as_when_both_are_moved(moved: Moved) -> None:
+    lin = linearise(moved.equilibria, moved.at.rho, moved.at.median, moved.at.final)
+    dx, _, dy = lin.forward(np.zeros_like(moved.drho), moved.dc)
+    np.testing.assert_allclose(lin.final_follows(dx), dy, atol=1e-12 * np.abs(dy).max())
+
+
+def test_the_guess_of_a_final_shape_that_follows_is_right_to_first_order(
+    moved: Moved, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the design with moved points, guessed where it is."""
+    at, lin = moved.at, linearise(moved.equilibria, moved.at.rho, moved.at.median, moved.at.final)
+    guesses, solve = list[np.ndarray](), Equilibria.solve_final
+
+    def watched(
+        self: Equilibria, rho: np.ndarray, median: Median, y: np.ndarray, *rest: object, **more: object
+    ) -> Final:
+        guesses.append(y)
+        return solve(self, rho, median, y, *rest, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Equilibria, "solve_final", watched)
+    off = []
+    for t in (0.02, 0.01):
+        there = equilibrate(
+            moved.equilibria,
+            at.rho,
+            moved.held + t * moved.dc,
+            at.median.x,
+            at.median.forces,
+            at.final.y,
+            TIGHT,
+            near=lin,
+        )
+        assert there is not None
+        off.append(np.linalg.norm(guesses[-1] - there.final.y))
+    assert off[1] < 0.3 * off[0]
 
 
 def weights_for(design: Design) -> ObjectiveWeights:

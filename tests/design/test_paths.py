@@ -15,6 +15,7 @@ from fab4d.design.influence import influence
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.paths import change_density, follow_density
 from fab4d.design.reduced import Search, refit
+from fab4d.design.sensitivity import linearise
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray
@@ -120,6 +121,14 @@ def test_held_positions_follow_so_that_the_error_stays_low(start: Start, monkeyp
     assert moved - fitted < 0.2 * (unmoved - fitted)
 
 
+def stays(equilibria: Equilibria, design: Design, moves: np.ndarray) -> Ahead:
+    """A change that moves the held positions and nothing else."""
+    none = np.zeros_like(design.final.y)
+    return Ahead(
+        moves, none, np.zeros_like(moves), none, linearise(equilibria, design.rho, design.median, design.final)
+    )
+
+
 @pytest.mark.parametrize(
     ("predicted_to", "by_models_to"), [(1.0, 1.0), (0.5, 1.0), (0.5, 0.75), (0.0, 1.0), (0.0, 0.0)]
 )
@@ -139,21 +148,21 @@ def test_models_lead_on_from_what_is_predicted_and_unloading_from_there(
         done.append((how, aim))
         return Design(rho, design.median, design.final)
 
-    def equilibrate(_: Equilibria, rho: np.ndarray, at: np.ndarray, *__: object, **how: bool) -> Design | None:
+    def equilibrate(_: Equilibria, rho: np.ndarray, at: np.ndarray, *__: object, **how: object) -> Design | None:
         assert how["stay"]
         if how.get("by_unloading"):
             # The median of these designs does not move: all of what is left is made in the last step.
             if rho[0] == 1.0:
                 np.testing.assert_allclose(at, held + (1 - by_models_to) * moves, atol=1e-12)
             return led("unloading", rho, 1.0)
+        assert how["near"] is ahead.near
         np.testing.assert_allclose(at, held + float(rho[0]) * moves, atol=1e-12)
         return led("predicted", rho, predicted_to)
 
     monkeypatch.setattr(paths, "equilibrate", equilibrate)
     monkeypatch.setattr(paths, "build_model", lambda *_: None)
     monkeypatch.setattr(paths, "prescribed_step", lambda *given: led("model", given[3], by_models_to))
-    none = np.zeros_like(design.final.y)
-    ahead = Ahead(moves, none, np.zeros_like(moves), none)
+    ahead = stays(equilibria, design, moves)
     found = follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     np.testing.assert_array_equal(found.rho, 1.0)
     expected = [("predicted", predicted_to), ("model", by_models_to), ("unloading", 1.0)]
@@ -174,8 +183,7 @@ def test_what_fails_is_tried_with_half_of_it_and_more_damping(start: Start, monk
     monkeypatch.setattr(paths, "_at_once", lambda *_: (half, 0.5))
     monkeypatch.setattr(paths, "build_model", lambda *given: models.append(given[3]))
     monkeypatch.setattr(paths, "prescribed_step", step)
-    none = np.zeros_like(design.final.y)
-    ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
+    ahead = stays(equilibria, design, np.zeros((2, 3)))
     follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     first = paths.FIRST_DAMPING
     np.testing.assert_allclose(tried, [(1.0, first), (0.75, paths.STIFFER * first), (1.0, first)])
@@ -190,8 +198,7 @@ def test_steps_of_models_come_down_to_a_part_of_the_smallest(start: Start, monke
     monkeypatch.setattr(paths, "build_model", lambda *_: None)
     monkeypatch.setattr(paths, "prescribed_step", lambda *given: tried.append(float(given[3][0])))
     monkeypatch.setattr(paths, "equilibrate", lambda *_, **__: None)
-    none = np.zeros_like(design.final.y)
-    ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
+    ahead = stays(equilibria, design, np.zeros((2, 3)))
     with pytest.raises(EquilibriumError):
         follow_density(equilibria, in_shares(design, n), np.ones(n), WEIGHTS, ahead)
     np.testing.assert_allclose(np.array(tried) - 0.5, [1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32])
@@ -202,8 +209,7 @@ def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.Mo
     equilibria, design = start
     for step in ("equilibrate", "prescribed_step"):
         monkeypatch.setattr(paths, step, lambda *_, **__: None)
-    none = np.zeros_like(design.final.y)
-    ahead = Ahead(np.zeros((2, 3)), none, np.zeros((2, 3)), none)
+    ahead = stays(equilibria, design, np.zeros((2, 3)))
     with pytest.raises(EquilibriumError, match="no equilibrium"):
         follow_density(equilibria, design, 1 - design.rho, WEIGHTS, ahead)
     with pytest.raises(EquilibriumError, match="no equilibrium"):

@@ -121,6 +121,19 @@ def test_everything_is_simulated_where_the_model_does_not_hold(
     assert hold["random_rms_mm"] == pytest.approx(hold["random_model_rms_mm"], rel=0.5)
 
 
+@pytest.mark.parametrize(("off", "known"), [((), 2), ((0,), 4), ((1,), 4), ((0, 3), 6), ((5,), 2)])
+def test_points_are_simulated_until_two_in_a_row_are_told_well(off: tuple[int, ...], known: int) -> None:
+    """Six points, the worst first in pairs; those of `off` have half the error that the model tells, or no state."""
+    told = np.array([3.0, 5.0, 4.0, 8.0, 6.0, 7.0])
+    order = np.argsort(-told).tolist()
+
+    def simulate(some: list[int]) -> list[float | None]:
+        half = {order[k]: (None if k else told[order[k]] / 2) for k in off}
+        return [half.get(k, float(told[k])) for k in some]
+
+    assert list(sensitivity.simulated_points(told, simulate)) == order[:known]
+
+
 def test_figures_grow_with_the_part(mesh: Arrays, report: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """A part ten times as large with pads ten times as far off has ten times the errors; moduli and forces alike."""
     monkeypatch.setattr(sensitivity, "HOLD_MM", 10.0)
@@ -163,7 +176,7 @@ def test_a_singular_tangent_is_a_reason_to_reject(inputs: dict[str, Any], monkey
     def singular(*_: Any) -> None:
         raise SingularMatrixError("unknown 7")  # noqa: EM101
 
-    monkeypatch.setattr(sensitivity, "response_of", singular)
+    monkeypatch.setattr(sensitivity, "linearise", singular)
     report = measured(inputs)
     assert not report["stable"]
     assert "unknown 7" in report["reasons"][0]
