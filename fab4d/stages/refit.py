@@ -65,20 +65,19 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     design = first.fitted
     trace.add("printed", Search(equilibria, first.design))
     trace.add("refit", Search(equilibria, design))
-    fits, reached = 0, None
+    fit = _Fit(design)
     if equilibria.patches.count:
-        polish = _polish(equilibria, weights, settings, trace)
-        design, fits, reached = _reachable_fit(equilibria, design, weights, polish, trace)
-    smp = design.rho > 0.5
-    design = polished(equilibria, design)
+        fit = _reachable_fit(equilibria, design, weights, _polish(equilibria, weights, settings, trace), trace)
+    smp = fit.design.rho > 0.5
+    design = polished(equilibria, fit.design)
     trace.add("refit", Search(equilibria, design))
     L0 = problem.length
     printed = {"x": design.median.x * L0, "y": design.final.y * L0} | patch_arrays(problem, equilibria.patches, design)
-    reasons = limit_reasons(problem, equilibria.patches, design, profile)
+    reasons = limit_reasons(problem, equilibria.patches, design, profile) + _not_reached(problem, fit, weights)
     volumes = tet_volumes(mesh["X"], mesh["tets"])
     report = {
         "tau_s": tau_s,
-        "fits": fits,
+        "fits": fit.fits,
         "flipped_fraction": float(problem.volume_fractions[smp != rounded["smp"]].sum()),
         "reasons": reasons,
         "left_out": left_out,
@@ -86,7 +85,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     return {
         "labels": {"smp": smp, "cluster": smp_clusters(mesh["tets"], volumes, smp)},
         "printed": printed,
-        "loaded": None if reached is None else _loaded_arrays(reached, problem),
+        "loaded": None if fit.loading is None else _loaded_arrays(fit.loading, problem),
         "refit_report": report,
         "refit_trace": trace.csv(),
     }
@@ -211,16 +210,28 @@ def _loaded_arrays(reached: Programming, problem: Problem) -> dict[str, np.ndarr
     }
 
 
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A fitted design, the fits made, and its loading, None where none went all the way.
+
+    missed : RMS error, L0, of the best fit from which loading ended elsewhere
+    """
+
+    design: Design
+    fits: int = 0
+    loading: Programming | None = None
+    missed: float = np.inf
+
+
 def _reachable_fit(
     equilibria: Equilibria, design: Design, weights: ObjectiveWeights, polish: Polish, trace: Trace
-) -> tuple[Design, int, Programming | None]:
+) -> _Fit:
     """Fit positions and labels, and simulate the loading to them: the state in which that ends is what the rig gets.
 
-    Where it is another equilibrium than the fit's, and misses the tolerance, the fit goes on from there. Returns the
-    state nearest to the temporary shape among those that loading ended in, the fits made, and its loading; the last fit
-    and None where no loading went all the way.
+    Where it is another equilibrium than the fit's, and misses the tolerance, the fit goes on from there. The state
+    nearest to the temporary shape among those that loading ended in; the last fit where no loading went all the way.
     """
-    ends = list[tuple[float, Design, Programming]]()
+    ends, missed = list[tuple[float, Design, Programming]](), np.inf
     for fit in range(1, MOST_FITS + 1):
         design = polish(refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
@@ -230,15 +241,27 @@ def _reachable_fit(
         if whole:
             ends.append((rms, end, done))
         if not there:
+            missed = min(missed, shape_error(equilibria.problem, design.final.y).rms)
             trace.add("reached", Search(equilibria, end))
         if there or (whole and rms <= weights.error_scale):
             break
         if fit < MOST_FITS:
             design = end
     if not ends:
-        return design, fit, None
+        return _Fit(design, fit, None, missed)
     _, nearest, loading = min(ends, key=lambda each: each[0])
-    return nearest, fit, loading
+    return _Fit(nearest, fit, loading, missed)
+
+
+def _not_reached(problem: Problem, fit: _Fit, weights: ObjectiveWeights) -> list[str]:
+    """Why the design misses the tolerance where a fit meets it."""
+    rms = shape_error(problem, fit.design.final.y).rms
+    if fit.loading is None or rms <= weights.error_scale or fit.missed > weights.error_scale:
+        return []
+    return [
+        f"its points hold two shapes: one is {fit.missed * problem.length:.3g} mm RMS off the temporary shape, but "
+        "loading from the permanent shape ends in the other; allow more points ([goal] max_forces)"
+    ]
 
 
 def _flip_settings(

@@ -319,6 +319,32 @@ def test_the_best_state_that_loading_ends_in_is_delivered(
     np.testing.assert_array_equal(found["loaded"]["y"], wanted.final.y * L0)
 
 
+@pytest.mark.parametrize(("share", "told"), [(1.2, True), (0.8, False), (1e3, False)])
+def test_a_fit_that_loading_does_not_lead_to_is_told_where_it_alone_meets_the_tolerance(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, share: float, told: bool
+) -> None:
+    """share : the tolerance, in errors of the fit"""
+
+    def elsewhere(equilibria: Equilibria, rho: np.ndarray, x: np.ndarray, forces: np.ndarray) -> Programming:
+        done = program(equilibria, rho, x, forces)
+        away = 0.02 * np.sin(3 * done.final.y[:, [1, 2, 0]])
+        return replace(done, final=replace(done.final, y=done.final.y + away))
+
+    monkeypatch.setattr(refit, "polish_labels", lambda equilibria, design, *_: design)  # noqa: ARG005
+    usual = refit.run(inputs, PROFILE, SilentMonitor())
+    problem = equilibria_of(inputs, usual).problem
+    fit_mm = shape_error(problem, usual["printed"]["y"] / problem.length).rms * problem.length
+    monkeypatch.setattr(refit, "program", elsewhere)
+    monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
+    monkeypatch.setattr(refit, "polished", lambda equilibria, design: design)  # noqa: ARG005
+    goal = Goal(tolerance=share * fit_mm, max_forces=4)
+    reasons = refit.run(inputs, PROFILE | {"goal": goal}, SilentMonitor())["refit_report"]["reasons"]
+    assert any("two shapes" in each for each in reasons) == told
+    if told:
+        off = float(reasons[0].split(" mm RMS")[0].split()[-1])
+        assert off == pytest.approx(fit_mm, rel=0.05)
+
+
 def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
     mesh, smp = inputs["mesh"], fitted[1]["labels"]["smp"]
     again = labels_for(mesh["X"], mesh["tets"], smp.astype(np.float64), np.ones(len(smp)), PROFILE["printer"])
