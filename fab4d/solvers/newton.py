@@ -23,9 +23,9 @@ class Status(Enum):
 
 
 MAX_HALVINGS = 20
-# A guess may be unstable where the equilibrium near it is not. From this iteration on, an unstable state leads away:
-# nearly all ways that come to something are stable again one step from the guess.
-ASTRAY = 1
+# A guess may be unstable where the equilibrium near it is not. Then each step leaves this share of its negative
+# eigenvalues at most; ways with more lead away, nearly all of them to nothing.
+STILL_NEGATIVE = 0.5
 # Steps with an old factor are far cheaper than those with a new one, as long as each leaves this share of the residual
 # at most.
 CHORD_GAIN = 0.3
@@ -81,8 +81,8 @@ def newton(
         step is reversed along their modes; where those are many or not found, it comes from `fallback`, which must have
         `n_negative`. These belong to the last n_negative unknowns, the multipliers of constraints.
     advance : z, step -> z after the step; differs from z + step in second order only
-    stay : give up where the tangent has other negative eigenvalues than it should after the first steps: the stationary
-        point that is found beyond is none near z
+    stay : give up where a step leaves more other negative eigenvalues than STILL_NEGATIVE of those before it: the
+        stationary point that is found beyond is none near z
     near : factor of the tangent at a state near z
     A step is halved until the residual or the potential falls; halvings because of the domain count as guarded. Steps
     with the last factor, which cost far less, go between as long as each brings the residual down enough; only steps
@@ -90,15 +90,17 @@ def newton(
     """
     at, guarded = residual(z), 0
     chord = near if near is not None and near.n_negative == n_negative else None
+    most = np.inf
     for iteration in range(max_iterations):
         if chord is not None:
             z, at = _with_one_factor(residual, chord, z, at, tolerance, advance)
         if at.norm <= tolerance * at.scale:
             return Solution(z, Status.CONVERGED, at.norm / at.scale, iteration, guarded)
         try:
-            step, chord = _step(factor, fallback, z, at.r, n_negative, stay and iteration >= ASTRAY)
+            step, chord, unstable = _step(factor, fallback, z, at.r, n_negative, most)
         except SingularMatrixError:
             return Solution(z, Status.SINGULAR, at.norm / at.scale, iteration, guarded)
+        most = STILL_NEGATIVE * unstable if stay else np.inf
         if step is None:
             return Solution(z, Status.UNSTABLE, at.norm / at.scale, iteration, guarded)
         t, slope = 1.0, float(at.r @ step)
@@ -144,25 +146,26 @@ def _step(
     z: FloatArray,
     r: FloatArray,
     n_negative: int,
-    stay: bool,
-) -> tuple[FloatArray | None, Factor | None]:
-    """Newton's step at z, changed where the tangent is singular or has more negative eigenvalues than it should, and
-    the factor where it is unchanged.
+    most: float,
+) -> tuple[FloatArray | None, Factor | None, int]:
+    """Newton's step at z, changed where the tangent is singular or has more negative eigenvalues than it should; the
+    factor where it is unchanged; how many more eigenvalues are negative.
 
-    No step where the tangent has, to stay.
+    No step where more than `most` are. A singular tangent counts as one with none, and is refused if `most` is finite.
     """
     try:
         tangent = factor(z)
     except SingularMatrixError:
-        if fallback is None or stay:
+        if fallback is None or np.isfinite(most):
             raise
-        return -fallback(z).solve(r), None
-    if fallback is None or tangent.n_negative <= n_negative:
-        return -tangent.solve(r), tangent
-    if stay:
-        return None, None
-    turned = descending(tangent, -tangent.solve(r), len(z) - n_negative, tangent.n_negative - n_negative)
-    return -fallback(z).solve(r) if turned is None else turned, None
+        return -fallback(z).solve(r), None, 0
+    unstable = max(tangent.n_negative - n_negative, 0)
+    if fallback is None or not unstable:
+        return -tangent.solve(r), tangent, unstable
+    if unstable > most:
+        return None, None, unstable
+    turned = descending(tangent, -tangent.solve(r), len(z) - n_negative, unstable)
+    return -fallback(z).solve(r) if turned is None else turned, None, unstable
 
 
 def _improves(new: Residual, old: Residual, t: float, slope: float, tolerance: float) -> bool:

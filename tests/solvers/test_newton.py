@@ -1,11 +1,13 @@
 """Newton away from saddle points: a chain of double wells, whose minima are known."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from fab4d.solvers.linear import Factor, analyse
 from fab4d.solvers.negative_modes import descending
-from fab4d.solvers.newton import ASTRAY, Residual, Status, newton
+from fab4d.solvers.newton import Residual, Status, newton
 
 N = 40
 STIFFNESS = 300.0
@@ -56,7 +58,7 @@ def test_ends_on_the_saddle_without_a_fallback(near_saddle):
 def test_stays_where_it_is_when_told_to():
     found = newton(wells, tangent, np.full(N, 1e-6), 1e-10, 20, no_fallback, stay=True)
     assert found.status is Status.UNSTABLE
-    assert found.iterations == ASTRAY
+    assert found.iterations == 1
     assert np.abs(found.z).max() < 1e-4
 
 
@@ -67,6 +69,30 @@ def test_an_unstable_guess_may_lead_to_a_stable_state_when_staying():
     found = newton(wells, tangent, start, 1e-10, 20, no_fallback, stay=True)
     assert found.converged
     assert np.allclose(found.z, 1.0)
+
+
+@pytest.mark.parametrize(("slow", "status", "iterations"), [(5, Status.CONVERGED, None), (7, Status.UNSTABLE, 1)])
+def test_staying_goes_on_while_steps_halve_what_is_unstable(
+    monkeypatch: pytest.MonkeyPatch, slow: int, status: Status, iterations: int | None
+) -> None:
+    """Wells of their own: 12 unstable ones, of which some are stable after two steps, the others after one."""
+    monkeypatch.setattr(sys.modules[__name__], "STIFFNESS", 1e-9)
+    start = np.full(N, 0.9)
+    start[:12] = 0.45
+    start[:slow] = 0.2
+    assert tangent(start).n_negative == 12
+
+    def spd(z: np.ndarray) -> Factor:
+        data = np.zeros(2 * N - 1)
+        data[::2] = np.abs(3 * z**2 - 1)
+        return analyse(INDPTR, INDICES).factor(data)
+
+    found = newton(wells, tangent, start, 1e-8, 20, spd, stay=True)
+    assert found.status is status
+    if iterations is None:
+        assert np.allclose(found.z, 1.0, atol=1e-6)
+    else:
+        assert found.iterations == iterations
 
 
 def test_a_stable_state_is_found_when_staying():
