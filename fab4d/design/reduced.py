@@ -41,7 +41,8 @@ LARGEST_TRACTION = 0.25
 # the second share of it: for errors that are asked to be far smaller than anybody needs, labels turn fine-grained, and
 # print worse.
 ROUNDING_LOSS, LEAST_SCALE = 1.5, 0.25
-# While there is too much SMP, its price grows by this power of the growth of lam_round.
+# While there is too much SMP, its price grows by this power of the growth of lam_round; below the limit it falls again,
+# for a price that drives SMP far below costs accuracy.
 DEARER = 0.86
 # So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
 # that are not taken, or taken with the largest damping and less than this share of the undecided tets decided.
@@ -94,6 +95,7 @@ class Search:
     """The whole state of the solver between two steps: going on from it gives the same bits as never having stopped.
 
     patch_radius : L0        phase : of the next step
+    dearer : the price of SMP while rounding, in lam_SMP
     iteration, slow : steps of this phase, and how many of the last gained little, or while rounding were stuck
     exchanges : how often points were exchanged; EXCHANGED when no more is to be gained that way
     accepted : whether the last step found a better design        relaxed_rms : RMS error, L0, before rounding began
@@ -105,6 +107,7 @@ class Search:
     patch_radius: float = 0.0
     phase: Phase = Phase.RELAX
     lam_SMP: float = 0.0
+    dearer: float = 1.0
     lam_round: float = 0.0
     damping: float = FIRST_DAMPING
     iteration: int = 0
@@ -301,9 +304,8 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
 
 def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     """Raise lam_round until all but a few densities are 0 or 1, held positions following, or steps come to nothing."""
-    too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
-    lam_SMP = settings.round_growth**DEARER * at.lam_SMP if too_much else at.lam_SMP
-    weights = _rounding_weights(replace(at, lam_SMP=lam_SMP), settings)
+    dearer = _dearer(at, settings)
+    weights = _rounding_weights(replace(at, dearer=dearer), settings)
     step = gauss_newton_step(at.equilibria, weights, L, at.design, at.damping, stay=at.stay)
     before, left = undecided_fraction(at.design.rho), undecided_fraction(step.design.rho)
     stuck = not step.accepted or (step.damping >= LARGEST_DAMPING and left > (1 - LEAST_DECIDED) * before)
@@ -315,7 +317,7 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
         at,
         design=step.design,
         phase=Phase.DONE if finished else Phase.ROUND,
-        lam_SMP=lam_SMP,
+        dearer=dearer,
         lam_round=settings.round_growth * at.lam_round,
         damping=min(step.damping, LARGEST_DAMPING),
         iteration=at.iteration + 1,
@@ -324,11 +326,18 @@ def round_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search:
     )
 
 
+def _dearer(at: Search, settings: ReducedSettings) -> float:
+    """How many times dearer SMP is in the next rounding step than before rounding."""
+    too_much = at.equilibria.problem.volume_fractions @ at.design.rho > settings.max_smp_fraction
+    factor = settings.round_growth**DEARER
+    return factor * at.dearer if too_much else max(at.dearer / factor, 1.0)
+
+
 def _rounding_weights(at: Search, settings: ReducedSettings) -> ObjectiveWeights:
     # Where the relaxed design is far better than it has to be, rounding may not spend all of that.
     tolerance = settings.weights.error_scale
     scale = float(np.clip(ROUNDING_LOSS * at.relaxed_rms, LEAST_SCALE * tolerance, tolerance))
-    return settings.weights.replace(error_scale=scale, lam_SMP=at.lam_SMP, lam_round=at.lam_round)
+    return settings.weights.replace(error_scale=scale, lam_SMP=at.dearer * at.lam_SMP, lam_round=at.lam_round)
 
 
 STEPS = {Phase.RELAX: relax_step, Phase.EXCHANGE: exchange_step, Phase.ROUND: round_step}

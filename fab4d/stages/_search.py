@@ -11,7 +11,18 @@ from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
 
-_NUMBERS = ("patch_radius", "lam_SMP", "lam_round", "damping", "iteration", "slow", "exchanges", "relaxed_rms", "stay")
+_NUMBERS = (
+    "patch_radius",
+    "lam_SMP",
+    "dearer",
+    "lam_round",
+    "damping",
+    "iteration",
+    "slow",
+    "exchanges",
+    "relaxed_rms",
+    "stay",
+)
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:

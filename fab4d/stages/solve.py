@@ -31,6 +31,8 @@ from fab4d.stages.refit import flip_settings
 CHECKPOINT, BEST, POINTS = "iterate", "best", "points"
 # Above this share of SMP the search makes it dearer, even if the goal names no limit.
 USUAL_SMP_FRACTION = 0.5
+# The share of SMP settles about the search's limit, which is this much of the goal's.
+WITHIN_LIMIT = 0.97
 LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors this mesh in memory"}]
 # Factors of lam_smooth and lam_SMP, tried in turn until the printed labels meet the tolerance: smoother interfaces lose
 # less when labels are repaired, and more SMP holds the shape better.
@@ -494,12 +496,12 @@ def search_settings(
     goal: Goal = profile["goal"]
     rig: RigCard = profile["rig"]
     weights = objective_weights(problem, goal, profile["weights"], rig, profile["materials"])
-    smooth, smp = ATTEMPTS[attempt]
+    (smooth, smp), limit = ATTEMPTS[attempt], goal.max_smp_fraction
     settings = ReducedSettings(
         n_points=most_points(goal, rig) if n_points is None else n_points,
         patch_radii=tuple(radius / problem.length for radius in rig.patch_radii),
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
-        max_smp_fraction=USUAL_SMP_FRACTION if goal.max_smp_fraction is None else goal.max_smp_fraction,
+        max_smp_fraction=USUAL_SMP_FRACTION if limit is None else WITHIN_LIMIT * limit,
     )
     fast = replace(settings, round_growth=FAST_GROWTH, nearly=1.0, decide_in_steps=False)
     return fast if problem.n_tets > MANY_TETS else settings

@@ -11,6 +11,7 @@ from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design
+from fab4d.design.gauss_newton import Step as Taken
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces, spread_centers
 from fab4d.design.paths import change_density
@@ -461,6 +462,31 @@ def test_fewer_smp_is_used_when_the_goal_says_so(truth: Truth, searched: list[Se
     limit = 0.7 * usual
     few = solve_reduced(problem, settings_for(problem, max_smp_fraction=limit), lambda at: None)  # noqa: ARG005
     assert float(problem.volume_fractions @ few.design.rho) < 1.1 * limit
+
+
+def test_smp_becomes_dearer_above_the_limit_and_cheaper_again_below(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Down to the price before rounding, be that higher than the usual one."""
+    problem, prices = truth.problem, list[float]()
+    start = first_search(problem, settings_for(problem))
+    shares = [0.6, 0.6, 0.49, 0.4, 0.6, 0.4, 0.4, 0.4]
+
+    def step(_: object, weights: ObjectiveWeights, __: object, design: Design, *___: object, **____: object) -> Taken:
+        prices.append(weights.lam_SMP)
+        after = replace(design, rho=np.full(problem.n_tets, shares[len(prices) % len(shares)]))
+        return Taken(after, 0.0, 0.1, True)
+
+    monkeypatch.setattr(reduced, "gauss_newton_step", step)
+    settings, L = settings_for(problem, max_smp_fraction=0.5), smoothness_matrix(problem)
+    before = 3 * settings.weights.lam_SMP
+    at = replace(start, phase=Phase.ROUND, lam_SMP=before, lam_round=1.0)
+    at = replace(at, design=replace(at.design, rho=np.full(problem.n_tets, shares[0])))
+    for _ in shares:
+        at = round_step(at, settings, L)
+    factor = settings.round_growth**reduced.DEARER
+    np.testing.assert_allclose(np.log(np.array(prices) / before) / np.log(factor), [1, 2, 1, 0, 1, 0, 0, 0], atol=1e-9)
+    assert at.lam_SMP == before
 
 
 def test_forces_keep_below_the_largest_one(truth: Truth, searched: list[Search]) -> None:
