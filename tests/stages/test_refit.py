@@ -12,6 +12,7 @@ import pytest
 from bent_bar import PROFILE as BENT_BAR
 from bent_bar import bent_bar
 
+from fab4d.design import reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings, at_interface
 from fab4d.design.forward import Programming, balance, program, same_shape
@@ -173,7 +174,9 @@ def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     as_they_are = change_density(equilibria, before, spoilt.astype(np.float64))
     printed = refit._printed_design(equilibria, inputs["relaxed"], spoilt, weights, settings).design
     fits = [refit.refit(equilibria, each, weights, lambda at: None) for each in (as_they_are, printed)]  # noqa: ARG005
-    assert rms(problem, fits[1]) <= rms(problem, fits[0])
+    # Fits of the same labels end as near to each other as a fit ends to the best held positions.
+    unchanged = np.array_equal(printed.rho, as_they_are.rho)
+    assert rms(problem, fits[1]) <= (1 + reduced.SLOW_REFIT * unchanged) * rms(problem, fits[0])
 
 
 def test_labels_are_mended_otherwise_where_their_repair_costs_much(
