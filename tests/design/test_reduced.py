@@ -11,7 +11,6 @@ from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design
-from fab4d.design.gauss_newton import Step as Taken
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces, spread_centers
 from fab4d.design.paths import change_density
@@ -472,10 +471,12 @@ def test_smp_becomes_dearer_above_the_limit_and_cheaper_again_below(
     start = first_search(problem, settings_for(problem))
     shares = [0.6, 0.6, 0.49, 0.4, 0.6, 0.4, 0.4, 0.4]
 
-    def step(_: object, weights: ObjectiveWeights, __: object, design: Design, *___: object, **____: object) -> Taken:
+    def step(
+        _: object, weights: ObjectiveWeights, __: object, design: Design, *___: object, **____: object
+    ) -> gauss_newton.Step:
         prices.append(weights.lam_SMP)
         after = replace(design, rho=np.full(problem.n_tets, shares[len(prices) % len(shares)]))
-        return Taken(after, 0.0, 0.1, True)
+        return gauss_newton.Step(after, 0.0, 0.1, True)
 
     monkeypatch.setattr(reduced, "gauss_newton_step", step)
     settings, L = settings_for(problem, max_smp_fraction=0.5), smoothness_matrix(problem)

@@ -379,6 +379,13 @@ def off_by(mesh: dict[str, np.ndarray], found: dict[str, Any]) -> float:
     return shape_error(problem, found["relaxed"]["y"] / problem.length).rms * problem.length
 
 
+def test_the_search_keeps_a_little_below_the_share_of_smp_that_the_goal_allows(bar: dict[str, np.ndarray]) -> None:
+    problem = problem_of(bar, PROFILE["materials"], "linear")
+    for limit in (0.0, 0.3, 1.0):
+        settings = search_settings(problem, PROFILE | {"goal": Goal(0.6, 3, max_smp_fraction=limit)})
+        assert 0.95 * limit <= settings.max_smp_fraction <= 0.98 * limit
+
+
 @pytest.mark.usefixtures("few")
 def test_a_design_that_is_lost_on_the_whole_mesh_is_searched_there(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
