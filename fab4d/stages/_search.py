@@ -1,6 +1,8 @@
 """The state of a search as arrays and back."""
 
 from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -11,18 +13,7 @@ from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, Search
 from fab4d.errors import ArtifactError
 
-_NUMBERS = (
-    "patch_radius",
-    "lam_SMP",
-    "dearer",
-    "lam_round",
-    "damping",
-    "iteration",
-    "slow",
-    "exchanges",
-    "relaxed_rms",
-    "stay",
-)
+_NUMBERS = {field.name: field.type for field in fields(Search) if field.type in (bool, int, float)}
 
 
 def search_arrays(at: Search) -> dict[str, np.ndarray]:
@@ -44,10 +35,8 @@ def search_from(problem: Problem, saved: Mapping[str, np.ndarray]) -> Search:
 
     Raises ArtifactError when they are not.
     """
-    numbers = dict(zip(_NUMBERS, saved["numbers"].tolist(), strict=True))
-    numbers |= {name: int(numbers[name]) for name in ("iteration", "slow", "exchanges")} | {
-        "stay": bool(numbers["stay"])
-    }
+    values = zip(_NUMBERS.items(), saved["numbers"].tolist(), strict=True)
+    numbers: dict[str, Any] = {name: kind(value) for (name, kind), value in values}
     equilibria = Equilibria(problem, build_patches(problem, saved["centers"], numbers["patch_radius"]))
     held = equilibria.patches.mean(saved["x"]) + RIG_COMPLIANCE * saved["forces"]
     design = equilibrate(equilibria, saved["rho"], held, saved["x"], saved["forces"], saved["y"])
