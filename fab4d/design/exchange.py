@@ -78,6 +78,29 @@ def exchanged(
             yield moved
 
 
+def held_apart(
+    equilibria: Equilibria, weights: ObjectiveWeights, model: Model, design: Design, other: FloatArray, radius: float
+) -> tuple[Equilibria, Design] | None:
+    """The design held where it differs most from another shape that its points hold, so that they hold one shape only.
+
+    model : of the objective at the design        other : (N, 3) median shape        radius : of a patch, L0
+    The point that helps least is given up. None where every vertex has a point near, or no equilibrium leads there.
+    """
+    patches, problem, X = equilibria.patches, equilibria.problem, equilibria.problem.body.X
+    among = pad_vertices(problem)
+    gaps = np.linalg.norm(X[among][:, None] - X[patches.centers], axis=2)
+    among = among[gaps.min(axis=1, initial=np.inf) > radius]
+    if not patches.count or not len(among):
+        return None
+    apart = np.linalg.norm(other - design.median.x, axis=1)[among]
+    center = among[[int(np.argmax(apart))]]
+    forces = force_model(equilibria, weights, model, design, _separate_patches(problem, center, radius))
+    points = list(range(patches.count + 1))
+    idle = min(points[:-1], key=lambda k: forces.without([p for p in points if p != k], [k]))
+    kept = np.delete(np.arange(patches.count), idle)
+    return _moved(equilibria, design, kept, np.concatenate([patches.centers[kept], center]), radius)
+
+
 # -- candidates
 
 

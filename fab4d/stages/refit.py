@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from fab4d.design.equilibria import Equilibria
+from fab4d.design.exchange import held_apart
 from fab4d.design.finish import carried_over
 from fab4d.design.flips import FlipSettings, compensated, error_left, mended, predicted
 from fab4d.design.forward import Programming, program, same_shape
-from fab4d.design.gauss_newton import Ahead, Design
+from fab4d.design.gauss_newton import Ahead, Design, build_model
 from fab4d.design.influence import Influence
-from fab4d.design.objective import ObjectiveWeights, shape_error
+from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.paths import SMALLEST_STEP, change_density, follow_density
 from fab4d.design.polish import polish_labels
@@ -48,7 +49,7 @@ WITHIN_REACH = 1.25
 FEW_STEPS = 3
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
-Polish = Callable[[Design], Design]
+Polish = Callable[[Equilibria, Design], Design]
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
@@ -65,10 +66,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     design = first.fitted
     trace.add("printed", Search(equilibria, first.design))
     trace.add("refit", Search(equilibria, design))
-    fit = _Fit(design)
+    fit = _Fit(equilibria, design)
     if equilibria.patches.count:
-        fit = _reachable_fit(equilibria, design, weights, _polish(equilibria, weights, settings, trace), trace)
-    smp = fit.design.rho > 0.5
+        radius = float(relaxed["patch_radius"]) / problem.length
+        fit = _reachable_fit(equilibria, design, weights, radius, _polish(weights, settings, trace), trace)
+    equilibria, smp = fit.equilibria, fit.design.rho > 0.5
     design = polished(equilibria, fit.design)
     trace.add("refit", Search(equilibria, design))
     L0 = problem.length
@@ -214,9 +216,11 @@ def _loaded_arrays(reached: Programming, problem: Problem) -> dict[str, np.ndarr
 class _Fit:
     """A fitted design, the fits made, and its loading, None where none went all the way.
 
+    equilibria : with the points of the design
     missed : RMS error, L0, of the best fit from which loading ended elsewhere
     """
 
+    equilibria: Equilibria
     design: Design
     fits: int = 0
     loading: Programming | None = None
@@ -224,33 +228,45 @@ class _Fit:
 
 
 def _reachable_fit(
-    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, polish: Polish, trace: Trace
+    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace
 ) -> _Fit:
     """Fit positions and labels, and simulate the loading to them: the state in which that ends is what the rig gets.
 
-    Where it is another equilibrium than the fit's, and misses the tolerance, the fit goes on from there. The state
-    nearest to the temporary shape among those that loading ended in; the last fit where no loading went all the way.
+    radius : of a patch, L0
+    Where it is another equilibrium than the fit's, and misses the tolerance, a point moves to where the two differ
+    most, or else the fit goes on from where loading ended. The state nearest to the temporary shape among those that
+    loading ended in; the last fit where no loading went all the way.
     """
-    ends, missed = list[tuple[float, Design, Programming]](), np.inf
-    for fit in range(1, MOST_FITS + 1):
-        design = polish(refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
+    ends, missed = list[tuple[float, _Fit]](), np.inf
+    for fits in range(1, MOST_FITS + 1):
+        design = polish(equilibria, refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         end = _programmed(done, design.rho)
         rms = shape_error(equilibria.problem, end.final.y).rms
         there, whole = same_shape(done, design.median.x), done.loaded == done.unloaded == 1.0
         if whole:
-            ends.append((rms, end, done))
+            ends.append((rms, _Fit(equilibria, end, loading=done)))
         if not there:
             missed = min(missed, shape_error(equilibria.problem, design.final.y).rms)
             trace.add("reached", Search(equilibria, end))
         if there or (whole and rms <= weights.error_scale):
             break
-        if fit < MOST_FITS:
-            design = end
-    if not ends:
-        return _Fit(design, fit, None, missed)
-    _, nearest, loading = min(ends, key=lambda each: each[0])
-    return _Fit(nearest, fit, loading, missed)
+        if fits < MOST_FITS:
+            equilibria, design = _begun_again(equilibria, design, end, whole, weights, radius)
+    nearest = min(ends, key=lambda each: each[0])[1] if ends else _Fit(equilibria, design)
+    return replace(nearest, fits=fits, missed=missed)
+
+
+def _begun_again(
+    equilibria: Equilibria, design: Design, end: Design, whole: bool, weights: ObjectiveWeights, radius: float
+) -> tuple[Equilibria, Design]:
+    """What the next fit begins with where loading ended elsewhere, after it went all the way or not."""
+    meets = shape_error(equilibria.problem, design.final.y).rms <= weights.error_scale
+    if not whole or not meets:
+        return equilibria, end
+    weights = weights.of_fixed_density()
+    model = build_model(equilibria, weights, smoothness_matrix(equilibria.problem), design)
+    return held_apart(equilibria, weights, model, design, end.median.x, radius) or (equilibria, end)
 
 
 def _not_reached(problem: Problem, fit: _Fit, weights: ObjectiveWeights) -> list[str]:
@@ -275,9 +291,11 @@ def _flip_settings(
     return replace(settings, rounds=FEW_ROUNDS) if few else settings
 
 
-def _polish(equilibria: Equilibria, weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Polish:
+def _polish(weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Polish:
     """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    return lambda design: polish_labels(equilibria, design, weights, settings, lambda at: trace.add("flips", at))
+    return lambda equilibria, design: polish_labels(
+        equilibria, design, weights, settings, lambda at: trace.add("flips", at)
+    )
 
 
 def flipped_down_to(relaxed_rms: float, tolerance: float, n_tets: int) -> float:

@@ -520,6 +520,7 @@ def _artifacts(
         "x": design.median.x * problem.length,
         "y": design.final.y * problem.length,
         "relaxed_rms": np.array(found.relaxed_rms * problem.length),
+        "patch_radius": np.array(found.patch_radius * problem.length),
     }
     return {
         "relaxed": relaxed | patch_arrays(problem, found.equilibria.patches, design),

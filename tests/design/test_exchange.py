@@ -16,6 +16,7 @@ from fab4d.design.exchange import (
     candidate_centers,
     exchanged,
     force_model,
+    held_apart,
     worst_centers,
 )
 from fab4d.design.forward import balance
@@ -84,6 +85,32 @@ def test_a_point_goes_where_it_helps(bent: tuple[Equilibria, Design]) -> None:
     assert left.final < 1e-4
     assert after.median.forces.shape == (2, 3)
     assert np.abs(problem.X_temp - after.final.y).max() < 0.5
+
+
+def test_a_point_that_helps_little_goes_where_two_shapes_differ_most(bent: tuple[Equilibria, Design]) -> None:
+    equilibria, design = bent
+    problem = equilibria.problem
+    place = corner(problem, (0.7, 1.0, 0.5))
+    away = np.exp(-(np.linalg.norm(problem.body.X - problem.body.X[place], axis=1) ** 2) / 0.02)
+    other = design.median.x + 0.1 * away[:, None] * [0.0, 0.6, 0.8]
+    moved = held_apart(equilibria, WEIGHTS, model_at(equilibria, design), design, other, RADIUS)
+    assert moved is not None
+    found, after = moved
+    assert found.patches.centers.tolist() == [corner(problem, (1.0, 0.5, 1.0)), place]
+    left = balance(found, after.rho, after.median, after.final)
+    assert max(left.median, left.final) < 1e-4
+
+
+def test_no_point_moves_to_where_others_are(bent: tuple[Equilibria, Design]) -> None:
+    """All vertices are within a radius of a point; and shapes that differ most at a point differ next to it as well."""
+    equilibria, design = bent
+    problem, model = equilibria.problem, model_at(equilibria, design)
+    assert held_apart(equilibria, WEIGHTS, model, design, design.median.x, 2.0) is None
+    tip = problem.body.X[corner(problem, (1.0, 0.5, 1.0))]
+    apart = np.exp(-np.linalg.norm(problem.body.X - tip, axis=1))
+    moved = held_apart(equilibria, WEIGHTS, model, design, design.median.x + 0.1 * apart[:, None], RADIUS)
+    assert moved is not None
+    assert np.linalg.norm(problem.body.X[moved[0].patches.centers[-1]] - tip) > RADIUS
 
 
 def test_the_step_keeps_an_exchange_only_where_the_objective_falls(bent: tuple[Equilibria, Design]) -> None:

@@ -338,6 +338,7 @@ def test_a_fit_that_loading_does_not_lead_to_is_told_where_it_alone_meets_the_to
     problem = equilibria_of(inputs, usual).problem
     fit_mm = shape_error(problem, usual["printed"]["y"] / problem.length).rms * problem.length
     monkeypatch.setattr(refit, "program", elsewhere)
+    monkeypatch.setattr(refit, "held_apart", lambda *_: None)
     monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
     monkeypatch.setattr(refit, "polished", lambda equilibria, design: design)  # noqa: ARG005
     goal = Goal(tolerance=share * fit_mm, max_forces=4)
@@ -346,6 +347,32 @@ def test_a_fit_that_loading_does_not_lead_to_is_told_where_it_alone_meets_the_to
     if told:
         off = float(reasons[0].split(" mm RMS")[0].split()[-1])
         assert off == pytest.approx(fit_mm, rel=0.05)
+
+
+def test_a_point_moves_to_where_loading_ends_elsewhere(inputs: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the fit meets the tolerance and the first loading bends off; the next one is what it is."""
+    told = list[tuple[Equilibria, FloatArray]]()
+
+    def elsewhere(equilibria: Equilibria, rho: np.ndarray, x: np.ndarray, forces: np.ndarray) -> Programming:
+        done = program(equilibria, rho, x, forces)
+        told.append((equilibria, x))
+        if len(told) > 1:
+            return done
+        X = equilibria.problem.body.X
+        sideways = np.exp(-(((X[:, 0] - 0.6 * X[:, 0].max()) / 0.2) ** 2))[:, None] * [0.0, 0.1, 0.0]
+        bent = replace(done.median, x=done.median.x + sideways), replace(done.final, y=done.final.y + sideways)
+        return replace(done, median=bent[0], final=bent[1])
+
+    monkeypatch.setattr(refit, "program", elsewhere)
+    found = refit.run(inputs, PROFILE, SilentMonitor())
+    before, after = (set(equilibria.patches.centers.tolist()) for equilibria, _ in told)
+    assert len(before) == len(after) == 4
+    (new,) = after - before
+    X = inputs["mesh"]["X"]
+    assert X[new, 0] == pytest.approx(0.6 * X[:, 0].max(), abs=0.15 * X[:, 0].max())
+    assert set(found["printed"]["patch_center"].tolist()) == after
+    assert found["refit_report"]["fits"] == 2
+    assert found["loaded"] is not None
 
 
 def test_labels_stay_printable(inputs: Artifacts, fitted: tuple[str, Artifacts]) -> None:
