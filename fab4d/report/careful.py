@@ -85,7 +85,7 @@ def _force_deviations(force: Mapping[str, Any]) -> list[Deviation]:
     return [
         Deviation(
             f"pads set by force gauge, all forces {100 * force['change']:g} % {way}",
-            force[way]["rms_mm"],
+            force[way]["rms_mm"] if force[way]["simulated"] else force[way]["model_rms_mm"],
             force[way]["model_rms_mm"],
         )
         for way in ("smaller", "larger")

@@ -44,8 +44,8 @@ def sensitivity_report() -> dict[str, Any]:
         },
         "force": {
             "change": 0.05,
-            "smaller": {"model_rms_mm": 0.6, "model_travel_mm": 7.0, "rms_mm": None},
-            "larger": {"model_rms_mm": 0.65, "model_travel_mm": 7.0, "rms_mm": 2.5},
+            "smaller": {"simulated": True, "model_rms_mm": 0.6, "model_travel_mm": 7.0, "rms_mm": None},
+            "larger": {"simulated": True, "model_rms_mm": 0.65, "model_travel_mm": 7.0, "rms_mm": 2.5},
             "points": [{"point": k, "model_rms_mm": 0.4, "model_travel_mm": 1.0} for k in (1, 2, 3)],
         },
         "modulus": {"change": 0.1, "tpe": both, "rubbery": both, "glassy": both},

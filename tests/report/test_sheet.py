@@ -173,6 +173,15 @@ def test_sheet_says_what_must_be_done_carefully(bar, rig_run, sensitivity):
         assert error in lines[:start]
 
 
+def test_changed_forces_that_were_not_simulated_are_told_by_the_model(bar, rig_run, sensitivity):
+    for way, told in (("smaller", 4.75), ("larger", 4.25)):
+        sensitivity["force"][way] |= {"simulated": False, "rms_mm": None, "model_rms_mm": told}
+    lines = pdf_text(rig_run(bar.state_artifact(), sensitivity=sensitivity)["rig_sheet"]).splitlines()
+    start = lines.index("What must be done carefully")
+    assert lines[next(k for k in range(start, len(lines)) if "all forces 5 % smaller" in lines[k]) + 1] == "4.75"
+    assert "jumps away" not in lines
+
+
 def test_sheet_without_sensitivity_has_no_care_and_no_warning(bar, rig_run, sensitivity):
     plain = pdf_text(rig_run(bar.state_artifact())["rig_sheet"])
     assert "What must be done carefully" not in plain

@@ -95,6 +95,18 @@ def test_moduli_are_those_of_a_design_made_anew(mesh: Arrays, inputs: dict[str, 
         assert report["modulus"][phase]["softer"]["rms_mm"] != pytest.approx(report["rms_mm"], rel=1e-4)
 
 
+def test_changed_forces_are_simulated_but_on_the_largest_meshes(
+    inputs: dict[str, Any], report: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sensitivity, "MOST_FORCED_TETS", len(inputs["mesh"]["tets"]) - 1)
+    large = measured(inputs)
+    assert large["left_out"] == [sensitivity.NOT_FORCED]
+    for way in ("smaller", "larger"):
+        assert report["force"][way]["simulated"]
+        assert report["force"][way]["rms_mm"] is not None
+        assert large["force"][way] == report["force"][way] | {"simulated": False, "rms_mm": None}
+
+
 def test_the_worst_pads_are_simulated(mesh: Arrays, inputs: dict[str, Any], report: dict[str, Any]) -> None:
     points = report["hold"]["points"]
     worst = sorted(points, key=lambda p: -p["model_rms_mm"])
