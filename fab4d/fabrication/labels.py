@@ -6,7 +6,7 @@ import numpy as np
 
 from fab4d.fabrication.bodies import Bodies, bodies_from_labels
 from fab4d.fabrication.features import without_thin_places
-from fab4d.fabrication.layers import unfilled
+from fab4d.fabrication.layers import FEW_LEVELS, MOST_LEVELS, unfilled
 from fab4d.fabrication.wellcomposed import pinched_vertices, well_composed
 from fab4d.mesh.measures import tet_volumes
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray, frozen
@@ -17,6 +17,8 @@ AMBIGUOUS = 0.05, 0.95
 
 MAX_UNFILLED = 0.025
 """Share of a body that lines may leave empty at its interface before the smallest feature grows; slices keep 3 %."""
+# Where a few layers leave less than this share of MAX_UNFILLED empty, so many more are not looked at.
+_CLEARLY_FILLED = 0.5
 MAX_GROWTHS = 2
 _GROWTH = 1.25, 2.0
 _SMALL_CHANGE = 0.02
@@ -135,7 +137,13 @@ def _unfilled_inside(bodies: Bodies, lines: Lines) -> float:
     """Share of the worse body that lines leave empty because of the interface; 0 with one material."""
     if len(bodies.printed) < 2:
         return 0.0
-    return max(body.share_inside for body in unfilled(bodies, lines.width, lines.height).values())
+
+    def share(most_levels: int) -> float:
+        found = unfilled(bodies, lines.width, lines.height, most_levels)
+        return max(body.share_inside for body in found.values())
+
+    first_look = share(FEW_LEVELS)
+    return first_look if first_look <= _CLEARLY_FILLED * MAX_UNFILLED else share(MOST_LEVELS)
 
 
 def rounded_labels(rho_or_labels: FloatArray | BoolArray) -> BoolArray:

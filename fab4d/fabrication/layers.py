@@ -13,8 +13,8 @@ import numpy as np
 from fab4d.fabrication.bodies import Bodies, Body, as_manifold
 from fab4d.mesh.tetmesh import FloatArray
 
-MOST_LEVELS = 48
-"""Layers that are looked at, evenly spaced where the part has more."""
+MOST_LEVELS, FEW_LEVELS = 48, 12
+"""Layers that are looked at, evenly spaced where the part has more; and where a first look is enough."""
 _SEGMENTS = 16
 _MITER = 2.0  # of a join that is not used
 
@@ -29,9 +29,11 @@ class Unfilled:
     """Middle of the largest empty area in the worst layer, mm."""
 
 
-def unfilled(bodies: Bodies, line_width: float, layer_height: float) -> dict[str, Unfilled]:
+def unfilled(
+    bodies: Bodies, line_width: float, layer_height: float, most_levels: int = MOST_LEVELS
+) -> dict[str, Unfilled]:
     """What stays empty of each body, by its name, when it is built along z with lines of `line_width` (mm)."""
-    levels = _levels(bodies.whole.vertices[:, 2], layer_height)
+    levels = _levels(bodies.whole.vertices[:, 2], layer_height, most_levels)
     outside = [_gaps(section, line_width) for section in _sections(bodies.whole, levels)]
     found = {}
     for body in bodies.printed:
@@ -52,11 +54,11 @@ def _sections(body: Body, levels: list[float]) -> list[manifold3d.CrossSection]:
     return [solid.slice(z) for z in levels]
 
 
-def _levels(z: FloatArray, layer_height: float) -> list[float]:
+def _levels(z: FloatArray, layer_height: float, most: int) -> list[float]:
     """Middles of layers, mm."""
     low, high = float(z.min()), float(z.max())
     count = max(1, round((high - low) / layer_height))
-    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_LEVELS)).astype(np.int64))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
     return [low + (high - low) * (k + 0.5) / count for k in chosen.tolist()]
 
 

@@ -46,10 +46,10 @@ def as_printed(
 ) -> Printed:
     """The design about as stage refit leaves it: printable labels, refitted held positions, then flipped labels.
 
-    The best of few repairs and none by annealing, for this judges many designs. Flips take long: they are left out up
-    to the RMS error `good_enough`, L0, and where they cannot reach the tolerance.
+    The best of few repairs and none by annealing, for this judges many designs. Flips take long: they end at the RMS
+    error `good_enough`, L0, and are left out where they cannot reach the tolerance.
     """
-    settings = flip_settings(mesh, printer, goal, found.relaxed_rms)
+    settings = flip_settings(mesh, printer, goal, max(found.relaxed_rms, good_enough))
     smp = repaired(mesh, printer, settings, found, weights, more=0).smp
     try:
         design = change_density(found.equilibria, found.design, smp.astype(np.float64))

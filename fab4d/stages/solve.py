@@ -45,7 +45,7 @@ FLIPS_WIN_BACK = 1.5
 NOT_LINEAR = {"what": "rounding in linear elements", "why": "quadratic ones round the relaxed design well"}
 # Linear elements round a design as well as quadratic ones, and much faster, where its error in quadratic ones is at
 # most this multiple of that in linear ones, held positions unchanged.
-LINEAR_HOLDS = 1.3
+LINEAR_HOLDS = 1.15
 LINEAR_ROUNDS = {
     "what": "rounding in quadratic elements",
     "why": "the relaxed design is near to that in linear ones",
