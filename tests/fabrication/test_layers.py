@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from fab4d.fabrication import labels
 from fab4d.fabrication.bodies import bodies_from_labels
 from fab4d.fabrication.labels import MAX_UNFILLED, Lines, printable_labels
-from fab4d.fabrication.layers import unfilled
+from fab4d.fabrication.layers import FEW_LEVELS, MOST_LEVELS, Unfilled, unfilled
 
 LINES = Lines(0.42, 0.2, 0.84, 0.4)
 
@@ -53,3 +54,25 @@ def test_a_design_is_not_cleaned_away_for_its_corners(meshes):
     bodies = bodies_from_labels(X, tets, result.smp)
     assert unfilled(bodies, 0.42, 0.2)["smp"].share_inside > MAX_UNFILLED
     assert result.changed_fraction["total"] < 0.03
+
+
+@pytest.mark.parametrize(("seen", "looks"), [(0.4, [FEW_LEVELS]), (0.6, [FEW_LEVELS, MOST_LEVELS])])
+def test_all_layers_are_looked_at_where_few_leave_much_empty(meshes, monkeypatch, seen, looks):
+    """seen : of what may be left empty, in every layer"""
+    X, tets = meshes["box"]((8, 4, 4), size=1.5)
+    asked = []
+
+    def told(bodies, _width, _height, most_levels):
+        asked.append(most_levels)
+        return {body.name: Unfilled(1.0, seen * MAX_UNFILLED, None) for body in bodies.printed}
+
+    monkeypatch.setattr(labels, "unfilled", told)
+    printable_labels(X, tets, X[tets].mean(axis=1)[:, 0] < 6.0, LINES)
+    assert asked == looks
+
+
+def test_few_layers_are_spread_as_many_are(meshes):
+    X, tets = meshes["box"]((4, 4, 12), size=0.5)
+    bodies = bodies_from_labels(X, tets, X[tets].mean(axis=1)[:, 0] < 1.0)
+    few, many = (unfilled(bodies, 0.4, 0.1, levels)["smp"] for levels in (FEW_LEVELS, MOST_LEVELS))
+    assert few.share == pytest.approx(many.share, rel=1e-6)  # every layer is the same

@@ -14,7 +14,7 @@ from fab4d.errors import EquilibriumError, SceneError
 from fab4d.io.meshes import read_mesh
 from fab4d.io.scene import Scene, Weights, load_scene
 from fab4d.runner.table import stage_table
-from fab4d.stages import check, solve, threshold, tradeoff
+from fab4d.stages import _printed, check, solve, threshold, tradeoff
 from fab4d.stages._design import problem_of
 from fab4d.stages._printed import as_printed, faults, refitted_in
 from fab4d.stages._search import search_from
@@ -156,6 +156,25 @@ def test_printed_labels_are_refitted_in_other_elements(
     fitted = refitted_in(quadratic, found, printed.design, weights.replace(error_scale=0.5 * carried))
     assert abs(carried / printed.rms - 1) > 0.02
     assert fitted < carried
+
+
+def test_flips_of_a_judged_design_end_where_it_is_good_enough(
+    scene: Scene, checked: dict[str, Any], judged: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, found, printed = judged
+    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    asked = list[float]()
+
+    def polished(_: Any, design: Any, __: Any, settings: Any, ___: Any) -> Any:
+        asked.append(settings.target_rms)
+        return design
+
+    monkeypatch.setattr(_printed, "polish_labels", polished)
+    good_enough = 0.5 * (found.relaxed_rms + printed.rms)
+    for down_to in (0.0, good_enough, 2 * printed.rms):
+        as_printed(problem, checked["mesh"], scene.printer, scene.goal, weights, found, down_to)
+    assert found.relaxed_rms < printed.rms
+    assert asked == [found.relaxed_rms, good_enough]
 
 
 @pytest.mark.parametrize(
