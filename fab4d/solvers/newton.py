@@ -134,7 +134,8 @@ def _with_one_factor(
     while at.norm > tolerance * at.scale:
         ahead = advance(z, -factor.solve(at.r))
         new = residual(ahead)
-        if new.norm > max(CHORD_GAIN * at.norm, tolerance * new.scale):
+        # Where both are outside the domain, no residual tells whether such steps lead anywhere.
+        if not np.isfinite(new.norm) or new.norm > max(CHORD_GAIN * at.norm, tolerance * new.scale):
             break
         z, at = ahead, new
     return z, at

@@ -142,6 +142,21 @@ def test_a_factor_that_brings_little_is_replaced():
     assert factor.count == found.iterations >= 1
 
 
+def test_a_factor_leads_nowhere_from_outside_the_domain():
+    """Inverted elements, say: no residual tells whether its steps help."""
+    seen = []
+
+    def within(z: np.ndarray) -> Residual:
+        seen.append(z)
+        assert len(seen) < 100
+        if np.abs(z).max() < 2:
+            return wells(z)
+        return Residual(np.full(N, np.inf), 1.0, np.inf)
+
+    start = np.full(N, 3.0)
+    assert not newton(within, tangent, start, 1e-10, 20, near=tangent(start)).converged
+
+
 def test_an_unstable_factor_is_not_used(near_saddle):
     """With it alone the steps would end on the saddle."""
     unstable = tangent(np.zeros(N))
