@@ -30,11 +30,11 @@ HOLD_MM, FORCE_CHANGE, MODULUS_CHANGE = 1.0, 0.05, 0.1
 # at most for so many in a row: it is better for what moves less. Where it was off, random moves are simulated too, so
 # many that come in pairs of opposite ones.
 SIMULATED_POINTS, MODEL_ERROR, RANDOM_MOVES = 2, 0.2, 4
-# Forces that move the points far take a hundred factorisations of as many tets, or are not found: more than an hour.
+# Forces that move the points far take some hundred factorisations, or are not found.
 MOST_FORCED_TETS = 100_000
 NOT_FORCED = {
     "what": "simulation of changed forces",
-    "why": f"it may take more than an hour on more than {MOST_FORCED_TETS} tets; their errors are by the model",
+    "why": f"it may take hundreds of factorisations of more than {MOST_FORCED_TETS} tets; told by the model",
 }
 ELEMENTS = {1: "linear", 2: "quadratic"}
 
