@@ -89,6 +89,9 @@ def newton(
     with a new factor count as iterations.
     """
     at, guarded = residual(z), 0
+    if not np.isfinite(at.norm):
+        # From outside the domain no residual tells where to go.
+        return Solution(z, Status.NO_STEP, np.inf, 0, guarded)
     chord = near if near is not None and near.n_negative == n_negative else None
     most = np.inf
     for iteration in range(max_iterations):
@@ -134,8 +137,7 @@ def _with_one_factor(
     while at.norm > tolerance * at.scale:
         ahead = advance(z, -factor.solve(at.r))
         new = residual(ahead)
-        # Where both are outside the domain, no residual tells whether such steps lead anywhere.
-        if not np.isfinite(new.norm) or new.norm > max(CHORD_GAIN * at.norm, tolerance * new.scale):
+        if new.norm > max(CHORD_GAIN * at.norm, tolerance * new.scale):
             break
         z, at = ahead, new
     return z, at

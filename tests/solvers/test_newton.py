@@ -142,19 +142,18 @@ def test_a_factor_that_brings_little_is_replaced():
     assert factor.count == found.iterations >= 1
 
 
-def test_a_factor_leads_nowhere_from_outside_the_domain():
-    """Inverted elements, say: no residual tells whether its steps help."""
-    seen = []
+def test_no_step_leads_on_from_outside_the_domain():
+    """Inverted elements, say: neither with the factor of a state nearby, which must not be tried for ever, nor else."""
+    seen, factor, start = [], Counted(), np.full(N, 3.0)
 
     def within(z: np.ndarray) -> Residual:
         seen.append(z)
         assert len(seen) < 100
-        if np.abs(z).max() < 2:
-            return wells(z)
-        return Residual(np.full(N, np.inf), 1.0, np.inf)
+        return wells(z) if np.abs(z).max() < 2 else Residual(np.full(N, np.inf), 1.0, np.inf)
 
-    start = np.full(N, 3.0)
-    assert not newton(within, tangent, start, 1e-10, 20, near=tangent(start)).converged
+    for near in (None, tangent(start)):
+        assert newton(within, factor, start, 1e-10, 20, near=near).status is Status.NO_STEP
+    assert factor.count == 0
 
 
 def test_an_unstable_factor_is_not_used(near_saddle):
