@@ -86,11 +86,9 @@ def held_apart(
     model : of the objective at the design        other : (N, 3) median shape        radius : of a patch, L0
     The point that helps least is given up. None where every vertex has a point near, or no equilibrium leads there.
     """
-    patches, problem, X = equilibria.patches, equilibria.problem, equilibria.problem.body.X
-    among = pad_vertices(problem)
-    gaps = np.linalg.norm(X[among][:, None] - X[patches.centers], axis=2)
-    among = among[gaps.min(axis=1, initial=np.inf) > radius]
-    if not patches.count or not len(among):
+    patches, problem = equilibria.patches, equilibria.problem
+    among = _away_from(problem, patches, pad_vertices(problem), radius)
+    if not len(among):
         return None
     apart = np.linalg.norm(other - design.median.x, axis=1)[among]
     center = among[[int(np.argmax(apart))]]
@@ -108,6 +106,11 @@ def candidate_centers(problem: Problem, patches: Patches, e: FloatArray, radius:
     """Vertices for new patches: half spread out, half where the error e (N, 3) is largest; none at `patches`."""
     half = CANDIDATES // 2
     centers = np.unique(np.concatenate([spread_centers(problem, half), worst_centers(problem, e, half, radius)]))
+    return _away_from(problem, patches, centers, radius)
+
+
+def _away_from(problem: Problem, patches: Patches, centers: IntArray, radius: float) -> IntArray:
+    """Those of the vertices `centers` that are not within a radius of the centre of a patch."""
     X = problem.body.X
     gaps = np.linalg.norm(X[centers][:, None] - X[patches.centers], axis=2)
     return centers[gaps.min(axis=1, initial=np.inf) > radius]

@@ -62,7 +62,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     if reasons:
         return {"sensitivity_report": _left_out("the state is not stable") | report}
     changes = _changes(equilibria, design, lin, response, monitor)
-    not_forced = [] if problem.n_tets <= MOST_FORCED_TETS else [NOT_FORCED]
+    not_forced = [] if changes["force"]["smaller"]["simulated"] else [NOT_FORCED]
     return {"sensitivity_report": report | changes | {"left_out": not_forced}}
 
 
