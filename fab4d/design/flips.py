@@ -18,8 +18,8 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 SURE_PRICE = 1e-3
 # A place that is pinched is worth this share to be mended.
 DEFECT_PRICE = 3e-3
-# Steps of the annealing for each candidate, where labels are made to be followed and where they are compared.
-STEPS, FEW_STEPS = 500, 100
+# Steps of an annealing for each candidate, where labels are made to be followed and where they are compared.
+STEPS, FEW_STEPS = 400, 50
 # Of more tets than this, each flip counts less, in proportion.
 USUAL_TETS = 5_000
 # Moves of held positions that would go too far are made so many times dearer.

@@ -1,11 +1,14 @@
 """What the other material in whole tets does to the final shape and to active limits, by linear algebra alone.
 
-The forces that flipped tets exert (`flip_loads.py`) go through the factors of the whole part.
+The forces that flipped tets exert (`flip_loads.py`) go through the factors of the whole part. What many flips do to the
+surface is told by few measures of it: random sums of flips span what most of them have in common (Halko, Martinsson,
+Tropp, SIAM Review 53 (2011) 217), and random fields tell how much of each is left out.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import combinations_with_replacement
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import qr
@@ -27,16 +30,16 @@ from fab4d.design.sensitivity import Linearisation, linearise
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 from fab4d.solvers.threads import side_by_side
 
-# Right-hand sides are made for so many flips at once.
-AT_ONCE = 256
+Result = TypeVar("Result")
+
+# So many measures are followed at once.
+AT_ONCE = 64
 # Held positions follow as a Gauss-Newton step with this damping lets them.
 HELD_DAMPING = 0.03
-# The whole surface is followed where the changes of it by all flips are at most so many numbers; else the error in
-# polynomials of this degree and in its own direction.
-MOST_NUMBERS, MODE_DEGREE = 30_000_000, 3
-# Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest, or so few
-# where each takes a solution.
-NEAR_LIMIT, MOST_LIMITS, FEW_LIMITS = 0.75, 300, 40
+# Random sums of flips that the measures of the surface span, and random fields that see what these leave out.
+SAMPLES, PROBES = 256, 16
+# Tets count as near a limit from this share of it on; so many limits are followed, those that are nearest.
+NEAR_LIMIT, MOST_LIMITS = 0.75, 100
 # The held positions settle among limits in so many tries of which of them hold back.
 MOST_ACTIVE_SETS = 10
 # How little a flip's worth follows what is seen of many.
@@ -70,8 +73,8 @@ class Limits:
         return self.rows_x @ z[:n] + self.rows_f @ z[n:]
 
 
-def limits_near(equilibria: Equilibria, design: Design, weights: ObjectiveWeights, most: int) -> Limits:
-    """The limits that the design is beyond, and those that it is near: `most` at most."""
+def limits_near(equilibria: Equilibria, design: Design, weights: ObjectiveWeights) -> Limits:
+    """The limits that the design is beyond, and those that it is near."""
     problem, median = equilibria.problem, design.median
     scale, k = weights.error_scale / np.sqrt(2), 3 * equilibria.patches.count
     forces = forces_beyond(weights, equilibria.patches, median)
@@ -81,7 +84,7 @@ def limits_near(equilibria: Equilibria, design: Design, weights: ObjectiveWeight
     no_shape, no_force = csr_array((len(forces.values), median.x.size)), np.zeros((len(values) - len(forces.values), k))
     rows_x = vstack([no_shape, stretch.rows, squeezed.rows], format="csr")
     rows_f = np.vstack([forces.rows, no_force])
-    kept = np.sort(np.argsort(-values, kind="stable")[:most])
+    kept = np.sort(np.argsort(-values, kind="stable")[:MOST_LIMITS])
     return Limits(scale * values[kept], scale * rows_x[kept], scale * rows_f[kept], median)
 
 
@@ -90,15 +93,14 @@ class View:
     """Linear measures of a design: (p,) of its final shape, which rigid motions do not change, and (l,) of its limits.
 
     on_surface (s,) : dofs that are looked at        root (s,) : roots of their area weights
-    basis (s, p) : orthonormal measures of it; None for all        rigid (s, 6) : weighted, orthonormal rigid modes
+    basis (s, p) : orthonormal measures of it
     shape_by_held (3K, p), limits_by_held (3K, l) : derivatives by the held positions
     ridge : what a move of a held position costs, squared errors for a squared length
     """
 
     on_surface: IntArray
     root: FloatArray
-    rigid: FloatArray
-    basis: FloatArray | None
+    basis: FloatArray
     limits: Limits
     shape_by_held: FloatArray
     limits_by_held: FloatArray
@@ -111,7 +113,7 @@ class View:
 
     def shape(self, problem: Problem, y: FloatArray) -> FloatArray:
         """(p,) error of the final shape y (N, 3)."""
-        return _measured(_weighted_error(problem, y, self.on_surface, self.root), self.rigid, self.basis)
+        return _weighted_error(problem, y, self.on_surface, self.root) @ self.basis
 
     def without_held(self, v: FloatArray) -> FloatArray:
         """Measures of the shape (..., p) without what the held positions take away where no limit holds them back."""
@@ -128,10 +130,12 @@ class Settled:
     """Moves (3K,) of the held positions that lower the objective of a predicted design most, and what is left.
 
     squared : the error in L0, squared, with what is expected of doubt, and that of the limits that it is beyond
+    active (l,) : the limits that hold them back
     """
 
     squared: float
     moves: FloatArray
+    active: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +144,7 @@ class FlipEnergy:
     tets (k,).
 
     error (p,), changes (k, p) : of the shape        beyond (l,), limit_changes (k, l) : of the limits
-    doubts (k,) : the squared error, L0^2, that is expected of a flip because its change comes out otherwise
+    doubts (k,) : the squared error, L0^2, that is expected of a flip besides
     price, defect_price : of each flip, and of each place that is left pinched, L0^2
     """
 
@@ -160,6 +164,7 @@ class Influence:
 
     tets (k,) : that may be flipped        shape (p,), beyond (l,) : measures of the design
     shape_change (k, p), limit_change (k, l) : by each flip at fixed held positions
+    unseen (k,) : the squared error, L0^2, of what a flip changes besides, mostly dents of its own
     lin, loads : the linear maps about the design, and what the flips exert
     doubt : the share of each change by which it is expected to come out otherwise
     """
@@ -169,6 +174,7 @@ class Influence:
     beyond: FloatArray
     shape_change: FloatArray
     limit_change: FloatArray
+    unseen: FloatArray
     view: View
     lin: Linearisation
     loads: FlipLoads
@@ -181,8 +187,9 @@ class Influence:
 
     @cached_property
     def doubts(self) -> FloatArray:
-        """(k,) squared error, L0^2, that is expected of each flip because its change comes out otherwise."""
-        return self.doubt**2 * np.einsum("kp,kp->k", self.change, self.change)
+        """(k,) squared error, L0^2, that is expected of each flip beside what its change, which may come out otherwise,
+        makes of the error."""
+        return self.unseen + self.doubt**2 * np.einsum("kp,kp->k", self.change, self.change)
 
     @cached_property
     def residual(self) -> FloatArray:
@@ -232,22 +239,36 @@ class Influence:
                 break
         settled = beyond + moves @ view.limits_by_held
         squared += float(2 * toward @ moves + moves @ view.gram @ moves + (np.maximum(settled, 0) ** 2).sum())
-        return Settled(max(squared, 0.0), moves)
+        return Settled(max(squared, 0.0), moves, settled > 0)
 
     def energy(self, flipped: BoolArray, price: float, defect_price: float = 0.0) -> "FlipEnergy":
-        """What flips cost where the tets `flipped` (k,) are flipped already. Prices are in squared errors then.
+        """What flips cost where the tets `flipped` (k,) are flipped already and the held positions have settled.
 
-        Held positions follow the shape alone: where limits hold them back the true error is smaller.
+        Prices are in squared errors then. From there the held positions follow along the limits that hold them back:
+        where these change the true error is smaller.
         """
         view, sign = self.view, np.where(flipped, -1.0, 1.0)[:, None]
         shape, beyond = self.measures(flipped)
-        followed = np.linalg.solve(view.gram, view.limits_by_held)
-        beyond = beyond - shape @ view.shape_by_held.T @ followed
-        limit_changes = self.limit_change - self.shape_change @ view.shape_by_held.T @ followed
-        error = view.without_held(shape)
+        settled = self.after(flipped)
+        error, beyond = shape + settled.moves @ view.shape_by_held, beyond + settled.moves @ view.limits_by_held
         squared = float(error @ error + (np.maximum(beyond, 0) ** 2).sum())
-        changes = sign * self.change, beyond, sign * limit_changes, sign[:, 0] * self.doubts
-        return FlipEnergy(self.tets, error, *changes, price * squared, defect_price * squared)
+        by_held = view.limits_by_held[:, settled.active]
+        pulls = self.shape_change @ view.shape_by_held.T + self.limit_change[:, settled.active] @ by_held.T
+        moves = -np.linalg.solve(view.gram + by_held @ by_held.T, pulls.T).T
+        changes, limit_changes = (
+            self.shape_change + moves @ view.shape_by_held,
+            self.limit_change + moves @ view.limits_by_held,
+        )
+        return FlipEnergy(
+            self.tets,
+            error,
+            sign * changes,
+            beyond,
+            sign * limit_changes,
+            sign[:, 0] * self.doubts,
+            price * squared,
+            defect_price * squared,
+        )
 
     def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.
@@ -284,36 +305,40 @@ def influence(
     root = np.sqrt(areas[on_surface])
     rigid, _ = np.linalg.qr(root[:, None] * rigid_modes(y).reshape(-1, 6)[on_surface])
     e = _weighted_error(problem, y, on_surface, root)
-    count = len(tets) if most is None else min(most, len(tets))
-    whole = count * len(on_surface) <= MOST_NUMBERS
-    limits = limits_near(equilibria, design, weights, MOST_LIMITS if whole else FEW_LIMITS)
+    limits = limits_near(equilibria, design, weights)
     lin = linearise(equilibria, design.rho, design.median, design.final)
 
-    def gradients(basis: FloatArray, of_limits: FloatArray) -> Gradients:
-        """Of the measures `basis` (s, q) of the shape and of_limits (l, q) of the limits."""
-        gy = np.zeros((y.size, basis.shape[1]))
-        gy[on_surface] = root[:, None] * basis
+    def gradients(of_shape: FloatArray, of_limits: FloatArray) -> Gradients:
+        """Of measures (s, q) of the shape and (l, q) of the limits."""
+        gy = np.zeros((y.size, of_shape.shape[1]))
+        gy[on_surface] = root[:, None] * of_shape
         return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, gy)
 
     loads = flip_loads(equilibria, design, lin, tets)
-    if len(tets) > count:
-        along_error = gradients(_measured(e, rigid, None)[:, None], np.maximum(limits.values, 0)[:, None])
-        promise, _ = _in_modes(lin, loads, along_error)
-        kept = np.sort(np.argsort(promise[:, 0], kind="stable")[:count])
+    if most is not None and len(tets) > most:
+        along_error = gradients(_without(rigid, e)[:, None], np.maximum(limits.values, 0)[:, None])
+        promise, _ = _seen(lin, loads, along_error)
+        kept = np.sort(np.argsort(promise[:, 0], kind="stable")[:most])
         tets, loads = tets[kept], loads.of(kept)
-    basis, n_limits = None, len(limits.values)
-    if whole:
-        change, by_held = _on_the_surface(lin, loads, on_surface, root, rigid, limits)
-    else:
-        basis = _smooth_modes(problem, root, rigid, e, on_surface)
-        modes = np.hstack([basis, np.zeros((len(basis), n_limits))])
-        each_limit = np.hstack([np.zeros((n_limits, basis.shape[1])), np.eye(n_limits)])
-        change, by_held = _in_modes(lin, loads, gradients(modes, each_limit))
-    width = change.shape[1] - n_limits
+
+    random = np.random.default_rng(0)
+    fields = root[:, None] * _spanning_fields(lin, loads, random)[on_surface]
+    basis = _orthonormal(_without(rigid, np.column_stack([e, fields])))
+    signs = random.choice([-1.0, 1.0], (len(basis), PROBES))
+    probes = _without(np.hstack([rigid, basis]), signs) / np.sqrt(PROBES)
+    of_shape = np.hstack([basis, probes, np.zeros((len(basis), len(limits.values)))])
+    of_limits = np.hstack([np.zeros((len(limits.values), basis.shape[1] + PROBES)), np.eye(len(limits.values))])
+
+    def seen(part: slice) -> tuple[FloatArray, FloatArray]:
+        return _seen(lin, loads, gradients(of_shape[:, part], of_limits[:, part]))
+
+    by_flips, by_held = map(np.hstack, zip(*_in_parts(seen, of_shape.shape[1], lin), strict=True))
+    shape_change, probed, limit_change = np.split(by_flips, [basis.shape[1], basis.shape[1] + PROBES], axis=1)
+    shape_by_held, _, limits_by_held = np.split(by_held, [basis.shape[1], basis.shape[1] + PROBES], axis=1)
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
-    view = View(on_surface, root, rigid, basis, limits, by_held[:, :width], by_held[:, width:], ridge)
-    shape_change, limit_change = change[:, :width], change[:, width:]
-    return Influence(tets, view.shape(problem, y), limits.values, shape_change, limit_change, view, lin, loads)
+    view = View(on_surface, root, basis, limits, shape_by_held, limits_by_held, ridge)
+    unseen, shape = (probed**2).sum(axis=1), view.shape(problem, y)
+    return Influence(tets, shape, limits.values, shape_change, limit_change, unseen, view, lin, loads)
 
 
 # -- from loads to measures
@@ -328,65 +353,49 @@ class Gradients:
     y: FloatArray
 
 
-def _on_the_surface(
-    lin: Linearisation, loads: FlipLoads, on_surface: IntArray, root: FloatArray, rigid: FloatArray, limits: Limits
-) -> tuple[FloatArray, FloatArray]:
-    """Change (k, s + l) by each flip and derivative (3K, s + l) by the held positions, of the weighted boundary
-    positions and of the limits."""
-
-    def seen(z: FloatArray, dy: FloatArray) -> FloatArray:
-        shape = _measured((root[:, None] * dy[on_surface]).T, rigid, None)
-        return np.hstack([shape, limits.changes(z).T])
-
-    n_tets = loads.hot.shape[1]
-    change = np.zeros((n_tets, len(on_surface) + len(limits.values)))
-
-    def follow(part: slice) -> None:
-        some = loads.of(part)
-        held = np.zeros((3 * lin.n_patches, some.hot.shape[1]))
-        change[part] = seen(*lin.respond(-np.vstack([some.hot.toarray(), held]), -some.cold.toarray()))
-
-    parts = [slice(first, min(first + AT_ONCE, n_tets)) for first in range(0, n_tets, AT_ONCE)]
-    side_by_side([partial(follow, part) for part in parts], lin.M.shape[0])
-    dx, df, dy = lin.held_columns()
-    return change, seen(np.vstack([dx, df]), dy)
-
-
-def _in_modes(lin: Linearisation, loads: FlipLoads, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
-    """The same of measures with these gradients: a solution for each of them, not for each flip."""
+def _seen(lin: Linearisation, loads: FlipLoads, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
+    """Change (k, q) by each flip, and derivative (3K, q) by the held positions, of q measures with these gradients."""
     n = lin.M.shape[0]
     of_median, of_final = lin.adjoint_states(gradients.x, gradients.f, gradients.y)
     return -(loads.hot.T @ of_median[:n] + loads.cold.T @ of_final), -of_median[n:]
 
 
-def _smooth_modes(
-    problem: Problem, root: FloatArray, rigid: FloatArray, e: FloatArray, on_surface: IntArray
-) -> FloatArray:
-    """(s, q) orthonormal measures without rigid motions: of the weighted error e (s,), and of polynomials."""
-    smooth = root[:, None] * _polynomials(problem.body.X, MODE_DEGREE)[on_surface]
-    basis = np.column_stack([e / max(float(np.abs(e).max()), 1e-300), smooth])
-    for _ in range(2):  # twice is enough for orthogonality to rounding
-        basis -= rigid @ (rigid.T @ basis)
-    # The fields are not independent on the few vertices of a coarse mesh.
-    basis, r, _ = qr(basis, mode="economic", pivoting=True)
+def _spanning_fields(lin: Linearisation, loads: FlipLoads, random: np.random.Generator) -> FloatArray:
+    """(3N, 3K + q) changes of the final shape by each held position and by random sums of flips."""
+    n_tets = loads.hot.shape[1]
+    sums = random.standard_normal((n_tets, min(SAMPLES, n_tets)))
+
+    def follow(part: slice) -> FloatArray:
+        hot, cold = -(loads.hot @ sums[:, part]), -(loads.cold @ sums[:, part])
+        held = np.zeros((3 * lin.n_patches, hot.shape[1]))
+        return lin.respond(np.vstack([hot, held]), cold)[1]
+
+    _, _, by_held = lin.held_columns()
+    return np.hstack([by_held, *_in_parts(follow, sums.shape[1], lin)])
+
+
+def _in_parts(call: Callable[[slice], Result], count: int, lin: Linearisation) -> list[Result]:
+    """Its results for slices of `count` measures, side by side."""
+    parts = [slice(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE)]
+    return side_by_side([partial(call, part) for part in parts], lin.M.shape[0])
+
+
+def _orthonormal(fields: FloatArray) -> FloatArray:
+    """(s, p) orthonormal basis of fields (s, q), of which some may depend on others."""
+    sizes = np.maximum(np.linalg.norm(fields, axis=0), np.finfo(np.float64).tiny)
+    basis, r, _ = qr(fields / sizes, mode="economic", pivoting=True)
     size = np.abs(np.diag(r))
     return basis[:, size > 1e-6 * size[0]]
+
+
+def _without(basis: FloatArray, fields: FloatArray) -> FloatArray:
+    """The part of fields (s,) or (s, q) that is orthogonal to an orthonormal basis (s, p)."""
+    for _ in range(2):  # twice is enough for orthogonality to rounding
+        fields = fields - basis @ (basis.T @ fields)
+    return fields
 
 
 def _weighted_error(problem: Problem, y: FloatArray, on_surface: IntArray, root: FloatArray) -> FloatArray:
     """(s,) error of the final shape y (N, 3), turned back to it; its length is the RMS error in L0."""
     error = shape_error(problem, y)
     return root * (error.e @ error.R).ravel()[on_surface]
-
-
-def _measured(v: FloatArray, rigid: FloatArray, basis: FloatArray | None) -> FloatArray:
-    """(..., q) measures of weighted fields (..., s)."""
-    return v @ basis if basis is not None else v - (v @ rigid) @ rigid.T
-
-
-def _polynomials(X: FloatArray, degree: int) -> FloatArray:
-    """(3N, q) vector fields: each monomial of X (N, 3) up to the degree in each of the three components."""
-    centred = (X - X.mean(axis=0)) / np.abs(X - X.mean(axis=0)).max()
-    powers = [c for d in range(degree + 1) for c in combinations_with_replacement(range(3), d)]
-    monomials = np.column_stack([centred[:, c].prod(axis=1) if c else np.ones(len(X)) for c in map(list, powers)])
-    return np.kron(monomials, np.eye(3))

@@ -20,7 +20,7 @@ from fab4d.errors import EquilibriumError
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 
 # So many tets near the interface, those that promise most, are candidates of a round; of many tets, in proportion more.
-MOST_CANDIDATES = 1500
+MOST_CANDIDATES = 3000
 # A flip has to lower the predicted squared error by this share of it: less once a round has come true, more once one
 # has not, for many flips at once are predicted worse than few. A round that wins at least the first share of what it
 # promised has come true, one that wins less than the second has not.

@@ -105,9 +105,10 @@ def anneal(
     random: np.random.Generator,
     links: Links,
     scratch: Scratch,
-) -> BoolArray:
-    """Which candidates (k,) to flip; `smp` (m,) and `squares` are changed on the way.
+) -> tuple[float, BoolArray]:
+    """The least energy found, less that of no flips, and which candidates (k,) to flip for it.
 
+    smp (m,), squares : are changed on the way
     prices : of each candidate (k,) and of each defect        room : volume that may become SMP
     temperatures : first and last
     """
@@ -147,4 +148,4 @@ def anneal(
         if energy < least:
             least = energy
             best[:] = flipped
-    return best
+    return least, best

@@ -6,6 +6,7 @@ lower the temperature (Kirkpatrick, Gelatt, Vecchi, Science 220 (1983) 671).
 """
 
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -15,8 +16,9 @@ from fab4d.fabrication.features import tet_neighbours
 from fab4d.fabrication.wellcomposed import link_tables
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
-# First and last temperature in squared errors of the labels to begin with.
-HOT, COLD = 1e-2, 1e-5
+# First temperatures, one for each annealing, and the last, in squared errors of the labels to begin with. Where each
+# flip changes much, only hot ones leave a valley; where each changes little, these go astray.
+HOT, COLD = (3e-3, 1e-2, 3e-2), 1e-5
 # Scalar products of the changes of so many tets are kept at most; of more they are worked out each time.
 MOST_PRODUCTS = 4000
 # More steps than these take minutes.
@@ -67,10 +69,14 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         squares = _squares(energy)
         start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum()) or 1.0
         prices = energy.price + energy.doubts, energy.defect_price
-        flipped = anneal(
-            labels.copy(), candidates, squares, prices, room, (HOT * start, COLD * start),
-            min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed), links, scratch,
-        )  # fmt: skip
+        most, random = min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed)
+
+        def from_temperature(hot: float) -> tuple[float, BoolArray]:
+            changed = squares._replace(**{name: getattr(squares, name).copy() for name in ("error", "slope", "beyond")})
+            temperatures = hot * start, COLD * start
+            return anneal(labels.copy(), candidates, changed, prices, room, temperatures, most, random, links, scratch)
+
+        _, flipped = min(map(from_temperature, HOT), key=itemgetter(0))
         result = labels.copy()
         result[energy.tets[flipped]] ^= True
         return result

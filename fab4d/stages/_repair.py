@@ -92,7 +92,7 @@ def influence_near(
 
 
 def _other_costs(by_volume: FloatArray, flips: Influence, more: int) -> Iterator[FloatArray]:
-    known = np.linalg.norm(flips.change, axis=1)
+    known = np.sqrt((flips.change**2).sum(axis=1) + flips.unseen)
     moved = np.full(len(by_volume), UNSEEN)
     moved[flips.tets] = known / known.mean()
     by_influence = VOLUME_SHARE * by_volume + (1 - VOLUME_SHARE) * moved

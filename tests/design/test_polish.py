@@ -262,7 +262,7 @@ def test_what_is_taught_is_what_flips_do_at_the_same_held_positions(monkeypatch:
         still, moves = seen[-1]
         moved = np.linalg.norm(moves @ self.view.shape_by_held)
         assert moved > 0
-        assert np.linalg.norm(shape - self.view.shape(problem, still.final.y)) < 0.5 * moved
+        assert np.linalg.norm(shape - self.view.shape(problem, still.final.y)) < 0.7 * moved
         return teach(self, flipped, shape, beyond)
 
     monkeypatch.setattr(polish, "_changed", changed)
