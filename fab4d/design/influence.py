@@ -67,11 +67,6 @@ class Limits:
         dx, df = median.x - self.median.x, median.forces - self.median.forces
         return self.values + self.rows_x @ dx.ravel() + self.rows_f @ df.ravel()
 
-    def changes(self, z: FloatArray) -> FloatArray:
-        """(l, q) by changes of median shape and forces (3N + 3K, q)."""
-        n = self.rows_x.shape[1]
-        return self.rows_x @ z[:n] + self.rows_f @ z[n:]
-
 
 def limits_near(equilibria: Equilibria, design: Design, weights: ObjectiveWeights) -> Limits:
     """The limits that the design is beyond, and those that it is near."""
@@ -255,20 +250,10 @@ class Influence:
         by_held = view.limits_by_held[:, settled.active]
         pulls = self.shape_change @ view.shape_by_held.T + self.limit_change[:, settled.active] @ by_held.T
         moves = -np.linalg.solve(view.gram + by_held @ by_held.T, pulls.T).T
-        changes, limit_changes = (
-            self.shape_change + moves @ view.shape_by_held,
-            self.limit_change + moves @ view.limits_by_held,
-        )
-        return FlipEnergy(
-            self.tets,
-            error,
-            sign * changes,
-            beyond,
-            sign * limit_changes,
-            sign[:, 0] * self.doubts,
-            price * squared,
-            defect_price * squared,
-        )
+        changes = sign * (self.shape_change + moves @ view.shape_by_held)
+        limit_changes, doubts = sign * (self.limit_change + moves @ view.limits_by_held), sign[:, 0] * self.doubts
+        prices = price * squared, defect_price * squared
+        return FlipEnergy(self.tets, error, changes, beyond, limit_changes, doubts, *prices)
 
     def taught(self, flipped: BoolArray, shape: FloatArray, beyond: FloatArray) -> "Influence":
         """The same after the tets `flipped` (k,) have really led to these measures: what they do together is that.
@@ -333,8 +318,9 @@ def influence(
         return _seen(lin, loads, gradients(of_shape[:, part], of_limits[:, part]))
 
     by_flips, by_held = map(np.hstack, zip(*_in_parts(seen, of_shape.shape[1], lin), strict=True))
-    shape_change, probed, limit_change = np.split(by_flips, [basis.shape[1], basis.shape[1] + PROBES], axis=1)
-    shape_by_held, _, limits_by_held = np.split(by_held, [basis.shape[1], basis.shape[1] + PROBES], axis=1)
+    ends = [basis.shape[1], basis.shape[1] + PROBES]
+    shape_change, probed, limit_change = np.split(by_flips, ends, axis=1)
+    shape_by_held, _, limits_by_held = np.split(by_held, ends, axis=1)
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
     view = View(on_surface, root, basis, limits, shape_by_held, limits_by_held, ridge)
     unseen, shape = (probed**2).sum(axis=1), view.shape(problem, y)

@@ -52,7 +52,7 @@ class Energy(Protocol):
     def defect_price(self) -> float: ...
 
 
-# Of labels (m,), the energy of flips, the volume that may become SMP, steps for each tet, and a seed.
+# Of labels (m,), the energy of flips, the volume that may become SMP, steps of each annealing for each tet, and a seed.
 Annealed = Callable[[BoolArray, Energy, float, int, int], BoolArray]
 
 

@@ -148,6 +148,23 @@ def test_there_is_an_end_to_the_steps(meshes, monkeypatch):
     np.testing.assert_array_equal(annealer(tets, volumes)(smp, energy, 1.0, 200, 1), smp)
 
 
+def test_the_least_energy_of_all_first_temperatures_is_taken(meshes, monkeypatch):
+    """None does worse than the one that is tried first alone, and some do better."""
+    tets, volumes, smp = case(meshes, 5)
+    energy = energy_by_chance(np.arange(len(tets)), 5, measures=60)
+    annealed, gains = annealer(tets, volumes), []
+    for first in annealing.HOT:
+        others = tuple(hot for hot in annealing.HOT if hot != first)
+        found = []
+        for temperatures in ((first,), (first, *others)):
+            monkeypatch.setattr(annealing, "HOT", temperatures)
+            found.append(energy.of(smp, annealed(smp, energy, 1.0, 2, 1)))
+        monkeypatch.undo()
+        gains.append(found[0] - found[1])
+    assert min(gains) >= -1e-12
+    assert max(gains) > 1e-6
+
+
 def test_a_seed_gives_the_same_labels_again(meshes):
     tets, volumes, smp = case(meshes, 5)
     energy = energy_by_chance(np.arange(len(tets)), 5, measures=60)
