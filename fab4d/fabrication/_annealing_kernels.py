@@ -18,10 +18,14 @@ SAME_TEMPERATURE = 256
 
 
 class Candidates(NamedTuple):
-    """Tets (k,) that may flip, their neighbours across faces (k, 4), -1 at the surface, and volumes (k,)."""
+    """Tets (k,) that may flip, their neighbours across faces (k, 4), -1 at the surface, and volumes (k,).
+
+    beside (k, 4) : which candidates the neighbours are, -1 for none
+    """
 
     tets: IntArray
     neighbours: IntArray
+    beside: IntArray
     volumes: FloatArray
 
 
@@ -41,25 +45,51 @@ class Squares(NamedTuple):
 
 
 @_sums
-def _rise(k: int, sign: float, squares: Squares) -> float:
-    """By how much the squares of the error grow with a flip, or with one taken back (sign -1)."""
+def _product(k: int, j: int, squares: Squares) -> float:
     if squares.gram.size:
-        return 2 * sign * squares.slope[k] + squares.gram[k, k]
-    slope = own = 0.0
+        return squares.gram[k, j]
+    product = 0.0
     for i in range(len(squares.error)):
-        slope += squares.changes[k, i] * squares.error[i]
-        own += squares.changes[k, i] * squares.changes[k, i]
-    return 2 * sign * slope + own
+        product += squares.changes[k, i] * squares.changes[j, i]
+    return product
 
 
 @_sums
-def _rise_of_limits(k: int, sign: float, squares: Squares) -> float:
+def _slope(k: int, squares: Squares) -> float:
+    if squares.gram.size:
+        return squares.slope[k]
+    slope = 0.0
+    for i in range(len(squares.error)):
+        slope += squares.changes[k, i] * squares.error[i]
+    return slope
+
+
+@_inner
+def _rise(move: IntArray, flipped: BoolArray, squares: Squares, price_of: FloatArray) -> float:
+    """By how much the squares of the error and the prices grow with flips of one or two candidates."""
+    rise = 0.0
+    for k in move:
+        rise += _product(k, k, squares) + _sign(k, flipped) * (2 * _slope(k, squares) + price_of[k])
+    if len(move) == 2:
+        rise += 2 * _sign(move[0], flipped) * _sign(move[1], flipped) * _product(move[0], move[1], squares)
+    return rise
+
+
+@_sums
+def _rise_of_limits(move: IntArray, flipped: BoolArray, squares: Squares) -> float:
     rise = 0.0
     for i in range(len(squares.beyond)):
-        before = max(squares.beyond[i], 0.0)
-        after = max(squares.beyond[i] + sign * squares.limit_changes[k, i], 0.0)
-        rise += after * after - before * before
+        before = after = squares.beyond[i]
+        for k in move:
+            after += _sign(k, flipped) * squares.limit_changes[k, i]
+        rise += max(after, 0.0) ** 2 - max(before, 0.0) ** 2
     return rise
+
+
+@_inner
+def _sign(k: int, flipped: BoolArray) -> float:
+    """-1 where a flip takes one back."""
+    return -1.0 if flipped[k] else 1.0
 
 
 @_inner
@@ -83,14 +113,45 @@ def _at_interface(k: int, smp: BoolArray, candidates: Candidates) -> bool:
 
 
 @_inner
-def _defects_left(tet: int, nowhere: BoolArray, smp: BoolArray, links: Links, scratch: Scratch) -> int:
-    """At the corners of a tet, once it is flipped."""
-    smp[tet] = not smp[tet]
-    left = 0
-    for vertex in links.vertices[tet]:
-        left += vertex_defects(vertex, nowhere, smp, links, scratch)
-    smp[tet] = not smp[tet]
-    return left
+def _flip(move: IntArray, smp: BoolArray, candidates: Candidates) -> bool:
+    """Whether each tet is at the interface once those before it are flipped; if not, none is."""
+    for i in range(len(move)):
+        if not _at_interface(move[i], smp, candidates):
+            _flip_back(move[:i], smp, candidates)
+            return False
+        tet = candidates.tets[move[i]]
+        smp[tet] = not smp[tet]
+    return True
+
+
+@_inner
+def _flip_back(move: IntArray, smp: BoolArray, candidates: Candidates) -> None:
+    for k in move:
+        smp[candidates.tets[k]] = not smp[candidates.tets[k]]
+
+
+@_inner
+def _volume(move: IntArray, smp: BoolArray, candidates: Candidates) -> float:
+    """That becomes SMP."""
+    volume = 0.0
+    for k in move:
+        volume += -candidates.volumes[k] if smp[candidates.tets[k]] else candidates.volumes[k]
+    return volume
+
+
+@_inner
+def _corners(move: IntArray, candidates: Candidates, links: Links, corners: IntArray) -> IntArray:
+    """Of the tets, each once; corners (8,) is room for them."""
+    count = 0
+    for k in move:
+        for vertex in links.vertices[candidates.tets[k]]:
+            known = False
+            for i in range(count):
+                known = known or corners[i] == vertex
+            if not known:
+                corners[count] = vertex
+                count += 1
+    return corners[:count]
 
 
 @njit(cache=True, nogil=True)
@@ -108,44 +169,55 @@ def anneal(
 ) -> tuple[float, BoolArray]:
     """The least energy found, less that of no flips, and which candidates (k,) to flip for it.
 
+    A step flips a tet, or two with a common face: the other may mend what the one would pinch. Places are pinched on
+    the way for a price, but what is found has no more of them than the labels to begin with.
+
     smp (m,), squares : are changed on the way
-    prices : of each candidate (k,) and of each defect        room : volume that may become SMP
-    temperatures : first and last
+    prices : of each candidate (k,), of each defect that is left, and of each besides on the way
+    room : volume that may become SMP        temperatures : first and last
     """
     nowhere = np.zeros(len(links.n_nodes), np.bool_)
     defects = all_defects(nowhere, smp, links, scratch)
     flipped = np.zeros(len(candidates.tets), np.bool_)
-    best = flipped.copy()
+    best, both, room_for_corners = flipped.copy(), np.zeros(2, np.int64), np.zeros(8, np.int64)
     energy = least = 0.0
-    (price_of, defect_price), (first, last) = prices, temperatures
-    temperature = first
+    more_defects = 0
+    (price_of, defect_price, on_the_way), (first, last) = prices, temperatures
+    temperature, worth = first, defect_price + on_the_way
     for step in range(steps):
         if step % SAME_TEMPERATURE == 0:
             temperature = first * (last / first) ** (step / steps)
-        k = int(random.integers(0, len(flipped)))
-        tet, sign, before = candidates.tets[k], -1.0 if flipped[k] else 1.0, 0
-        for vertex in links.vertices[tet]:
+        both[0] = random.integers(0, len(flipped))
+        both[1] = candidates.beside[both[0], random.integers(0, 4)] if step % 2 else -1
+        move = both[: 1 if both[1] < 0 else 2]
+        corners = _corners(move, candidates, links, room_for_corners)
+        before = left = 0
+        for vertex in corners:
             before += defects[vertex]
-        # At best the flip removes all defects at its corners.
-        allowed = before * defect_price - temperature * np.log(1.0 - random.random())
-        rise = _rise(k, sign, squares) + sign * price_of[k]
-        if rise > allowed or not _at_interface(k, smp, candidates) or (not smp[tet] and candidates.volumes[k] > room):
+        # At best the flips remove all defects at their corners.
+        allowed = before * worth - temperature * np.log(1.0 - random.random())
+        rise = _rise(move, flipped, squares, price_of)
+        volume = _volume(move, smp, candidates)
+        if rise > allowed or volume > max(room, 0.0):
             continue
         if len(squares.beyond):
-            rise += _rise_of_limits(k, sign, squares)
-        if rise > allowed:
+            rise += _rise_of_limits(move, flipped, squares)
+        if rise > allowed or not _flip(move, smp, candidates):
             continue
-        left = _defects_left(tet, nowhere, smp, links, scratch)
-        rise += (left - before) * defect_price
-        if left > before or rise > allowed - before * defect_price:
+        for vertex in corners:
+            left += vertex_defects(vertex, nowhere, smp, links, scratch)
+        if rise > allowed - left * worth:
+            _flip_back(move, smp, candidates)
             continue
-        _take(k, sign, squares)
-        room += candidates.volumes[k] if smp[tet] else -candidates.volumes[k]
-        smp[tet], flipped[k] = not smp[tet], not flipped[k]
-        for vertex in links.vertices[tet]:
+        for vertex in corners:
             defects[vertex] = vertex_defects(vertex, nowhere, smp, links, scratch)
-        energy += rise
-        if energy < least:
+        for k in move:
+            _take(k, _sign(k, flipped), squares)
+            flipped[k] = not flipped[k]
+        room -= volume
+        more_defects += left - before
+        energy += rise + (left - before) * defect_price
+        if energy < least and more_defects <= 0:
             least = energy
             best[:] = flipped
     return least, best

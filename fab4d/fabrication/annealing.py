@@ -2,7 +2,8 @@
 
 One flip after the other, each for the better, soon finds none that is allowed: most would pinch the boundary where they
 are, and others are needed first that make the error larger. Simulated annealing takes these too, the more rarely the
-lower the temperature (Kirkpatrick, Gelatt, Vecchi, Science 220 (1983) 671).
+lower the temperature (Kirkpatrick, Gelatt, Vecchi, Science 220 (1983) 671). On the way the boundary is pinched where
+that brings much, for others to mend; what is found is pinched no more than at first.
 """
 
 from collections.abc import Callable
@@ -19,6 +20,9 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 # First temperatures, one for each annealing, and the last, in squared errors of the labels to begin with. Where each
 # flip changes much, only hot ones leave a valley; where each changes little, these go astray.
 HOT, COLD = (3e-3, 1e-2, 3e-2), 1e-5
+# What each pinched place costs on the way, in first temperatures: for less too many are left in the end, for more few
+# flips are made that others have to follow.
+PINCHED = 6.0
 # Scalar products of the changes of so many tets are kept at most; of more they are worked out each time.
 MOST_PRODUCTS = 4000
 # More steps than these take minutes.
@@ -65,15 +69,15 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
     neighbours = tet_neighbours(tets)
 
     def annealed(labels: BoolArray, energy: Energy, room: float, steps: int, seed: int) -> BoolArray:
-        candidates = Candidates(energy.tets, neighbours[energy.tets], volumes[energy.tets])
+        candidates = _candidates(energy.tets, neighbours, volumes)
         squares = _squares(energy)
         start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum()) or 1.0
-        prices = energy.price + energy.doubts, energy.defect_price
         most, random = min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed)
 
         def from_temperature(hot: float) -> tuple[float, BoolArray]:
             changed = squares._replace(**{name: getattr(squares, name).copy() for name in ("error", "slope", "beyond")})
             temperatures = hot * start, COLD * start
+            prices = energy.price + energy.doubts, energy.defect_price, PINCHED * hot * start
             return anneal(labels.copy(), candidates, changed, prices, room, temperatures, most, random, links, scratch)
 
         _, flipped = min(map(from_temperature, HOT), key=itemgetter(0))
@@ -82,6 +86,13 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         return result
 
     return annealed
+
+
+def _candidates(tets: IntArray, neighbours: IntArray, volumes: FloatArray) -> Candidates:
+    # The last place stands for the neighbour across the surface.
+    place = np.full(len(neighbours) + 1, -1)
+    place[tets] = np.arange(len(tets))
+    return Candidates(tets, neighbours[tets], place[neighbours[tets]], volumes[tets])
 
 
 def _squares(energy: Energy) -> Squares:
