@@ -7,6 +7,8 @@ that brings much, for others to mend; what is found is pinched no more than at f
 """
 
 from collections.abc import Callable
+from copy import deepcopy
+from functools import partial
 from operator import itemgetter
 from typing import Protocol
 
@@ -16,6 +18,7 @@ from fab4d.fabrication._annealing_kernels import Candidates, Squares, anneal
 from fab4d.fabrication.features import tet_neighbours
 from fab4d.fabrication.wellcomposed import link_tables
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
+from fab4d.solvers.threads import side_by_side
 
 # First temperatures, one for each annealing, and the last, in squared errors of the labels to begin with. Where each
 # flip changes much, only hot ones leave a valley; where each changes little, these go astray.
@@ -72,15 +75,17 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         candidates = _candidates(energy.tets, neighbours, volumes)
         squares = _squares(energy)
         start = float(energy.error @ energy.error + (np.maximum(energy.beyond, 0) ** 2).sum()) or 1.0
-        most, random = min(steps * len(energy.tets), MOST_STEPS), np.random.default_rng(seed)
+        most = min(steps * len(energy.tets), MOST_STEPS)
 
-        def from_temperature(hot: float) -> tuple[float, BoolArray]:
+        def from_temperature(hot: float, random: np.random.Generator) -> tuple[float, BoolArray]:
             changed = squares._replace(**{name: getattr(squares, name).copy() for name in ("error", "slope", "beyond")})
             temperatures = hot * start, COLD * start
             prices = energy.price + energy.doubts, energy.defect_price, PINCHED * hot * start
-            return anneal(labels.copy(), candidates, changed, prices, room, temperatures, most, random, links, scratch)
+            work = deepcopy(scratch)
+            return anneal(labels.copy(), candidates, changed, prices, room, temperatures, most, random, links, work)
 
-        _, flipped = min(map(from_temperature, HOT), key=itemgetter(0))
+        found = side_by_side([partial(from_temperature, hot, np.random.default_rng(seed)) for hot in HOT], 0)
+        _, flipped = min(found, key=itemgetter(0))
         result = labels.copy()
         result[energy.tets[flipped]] ^= True
         return result

@@ -189,6 +189,16 @@ def test_the_least_energy_of_all_first_temperatures_is_taken(meshes, monkeypatch
     assert max(gains) > 1e-6
 
 
+def test_annealings_side_by_side_find_what_one_after_the_other_finds(meshes, monkeypatch):
+    tets, volumes, smp = case(meshes, 5, 100)
+    energy = energy_by_chance(np.arange(len(tets)), 5, measures=60)
+    annealed = annealer(tets, volumes)
+    together = annealed(smp, energy, 1.0, 400, 1)
+    monkeypatch.setattr(annealing, "side_by_side", lambda calls, _: [call() for call in calls])
+    np.testing.assert_array_equal(annealed(smp, energy, 1.0, 400, 1), together)
+    assert (together != smp).any()
+
+
 def test_a_seed_gives_the_same_labels_again(meshes):
     tets, volumes, smp = case(meshes, 5)
     energy = energy_by_chance(np.arange(len(tets)), 5, measures=60)
