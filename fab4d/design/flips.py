@@ -18,8 +18,10 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 SURE_PRICE = 1e-3
 # A place that is pinched is worth this share to be mended.
 DEFECT_PRICE = 3e-3
-# Steps of an annealing for each candidate, where labels are made to be followed and where they are compared.
+# Steps of an annealing for each candidate, where labels are made to be followed and where they are compared; of fewer
+# candidates than so many, each gets more in proportion, up to so many times: they take little time.
 STEPS, FEW_STEPS = 400, 50
+MANY_CANDIDATES, MORE_STEPS = 3000, 5
 # Of more tets than this, each flip counts less, in proportion.
 USUAL_TETS = 5_000
 # Moves of held positions that would go too far are made so many times dearer.
@@ -116,7 +118,8 @@ def flip(
     """
     energy = found.energy((labels != before)[found.tets], price, defect_price)
     room = settings.max_smp_fraction - float(problem.volume_fractions @ labels)
-    return settings.annealed(labels, energy, room, steps, seed)
+    more = min(max(MANY_CANDIDATES // max(len(found.tets), 1), 1), MORE_STEPS)
+    return settings.annealed(labels, energy, room, more * steps, seed)
 
 
 def near_interface(problem: Problem, labels: BoolArray) -> BoolArray:

@@ -50,6 +50,23 @@ def test_flips_lower_the_predicted_error_and_fewer_are_made_where_they_are_dear(
     assert left[2] == pytest.approx(np.linalg.norm(found.residual), rel=0.05)
 
 
+def test_few_candidates_get_more_steps_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times as many where there are a third of many, and no more than so many times."""
+    problem = bar(degrees=30.0)
+    equilibria, smp = two_patches(problem), upper_half(problem)
+    found, given = at_all_tets(equilibria, held_design(equilibria, smp.astype(float), problem.X_temp)), list[int]()
+
+    def annealed(labels: np.ndarray, _energy: FlipEnergy, _room: float, steps: int, _seed: int) -> np.ndarray:
+        given.append(steps)
+        return labels
+
+    settings, count = replace(freely(problem), annealed=annealed), len(found.tets)
+    for many in (count // 2, 3 * count, 100 * count):
+        monkeypatch.setattr(flips, "MANY_CANDIDATES", many)
+        flip(problem, found, smp, smp, settings, 0.0, 10)
+    assert given == [10, 30, 10 * flips.MORE_STEPS]
+
+
 def test_a_repair_is_made_up_for() -> None:
     """Tets that were changed by force may be given back, or others changed: the predicted error falls."""
     problem = bar(cells=(6, 3, 2), degrees=30.0)
