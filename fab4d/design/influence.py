@@ -284,50 +284,63 @@ def influence(
     equilibria: Equilibria, design: Design, tets: IntArray, weights: ObjectiveWeights, most: int | None = None
 ) -> Influence:
     """What a flip of each of `tets` of a near 0/1 design does to its error, or of the `most` that promise most."""
-    problem, y = equilibria.problem, design.final.y
-    areas = np.repeat(problem.area_weights, 3)
-    on_surface = np.flatnonzero(areas)
-    root = np.sqrt(areas[on_surface])
-    rigid, _ = np.linalg.qr(root[:, None] * rigid_modes(y).reshape(-1, 6)[on_surface])
-    e = _weighted_error(problem, y, on_surface, root)
+    surface = _surface(equilibria.problem, design.final.y)
     limits = limits_near(equilibria, design, weights)
     lin = linearise(equilibria, design.rho, design.median, design.final)
-
-    def gradients(of_shape: FloatArray, of_limits: FloatArray) -> Gradients:
-        """Of measures (s, q) of the shape and (l, q) of the limits."""
-        gy = np.zeros((y.size, of_shape.shape[1]))
-        gy[on_surface] = root[:, None] * of_shape
-        return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, gy)
-
     loads = flip_loads(equilibria, design, lin, tets)
     if most is not None and len(tets) > most:
-        along_error = gradients(_without(rigid, e)[:, None], np.maximum(limits.values, 0)[:, None])
-        promise, _ = _seen(lin, loads, along_error)
-        kept = np.sort(np.argsort(promise[:, 0], kind="stable")[:most])
+        kept = _promising(lin, loads, surface, limits, most)
         tets, loads = tets[kept], loads.of(kept)
 
     random = np.random.default_rng(0)
-    fields = root[:, None] * _spanning_fields(lin, loads, random)[on_surface]
-    basis = _orthonormal(_without(rigid, np.column_stack([e, fields])))
+    fields = surface.root[:, None] * _spanning_fields(lin, loads, random)[surface.dofs]
+    basis = _orthonormal(_without(surface.rigid, np.column_stack([surface.error, fields])))
     signs = random.choice([-1.0, 1.0], (len(basis), PROBES))
-    probes = _without(np.hstack([rigid, basis]), signs) / np.sqrt(PROBES)
+    probes = _without(np.hstack([surface.rigid, basis]), signs) / np.sqrt(PROBES)
     of_shape = np.hstack([basis, probes, np.zeros((len(basis), len(limits.values)))])
     of_limits = np.hstack([np.zeros((len(limits.values), basis.shape[1] + PROBES)), np.eye(len(limits.values))])
 
     def seen(part: slice) -> tuple[FloatArray, FloatArray]:
-        return _seen(lin, loads, gradients(of_shape[:, part], of_limits[:, part]))
+        return _seen(lin, loads, _gradients(surface, limits, of_shape[:, part], of_limits[:, part]))
 
     by_flips, by_held = map(np.hstack, zip(*_in_parts(seen, of_shape.shape[1], lin), strict=True))
     ends = [basis.shape[1], basis.shape[1] + PROBES]
     shape_change, probed, limit_change = np.split(by_flips, ends, axis=1)
     shape_by_held, _, limits_by_held = np.split(by_held, ends, axis=1)
     ridge = HELD_DAMPING * weights.error_scale**2 / (max(len(by_held), 1) * HELD_STEP**2)
-    view = View(on_surface, root, basis, limits, shape_by_held, limits_by_held, ridge)
-    unseen, shape = (probed**2).sum(axis=1), view.shape(problem, y)
+    view = View(surface.dofs, surface.root, basis, limits, shape_by_held, limits_by_held, ridge)
+    unseen, shape = (probed**2).sum(axis=1), view.shape(equilibria.problem, design.final.y)
     return Influence(tets, shape, limits.values, shape_change, limit_change, unseen, view, lin, loads)
 
 
 # -- from loads to measures
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """What is looked at of a final shape: dofs (s,), roots (s,) of their area weights, the error (s,), whose length is
+    the RMS error in L0, and orthonormal rigid motions (s, 6). n_dofs : of the whole shape"""
+
+    dofs: IntArray
+    root: FloatArray
+    error: FloatArray
+    rigid: FloatArray
+    n_dofs: int
+
+
+def _surface(problem: Problem, y: FloatArray) -> _Surface:
+    areas = np.repeat(problem.area_weights, 3)
+    dofs = np.flatnonzero(areas)
+    root = np.sqrt(areas[dofs])
+    rigid, _ = np.linalg.qr(root[:, None] * rigid_modes(y).reshape(-1, 6)[dofs])
+    return _Surface(dofs, root, _weighted_error(problem, y, dofs, root), rigid, y.size)
+
+
+def _promising(lin: Linearisation, loads: FlipLoads, surface: _Surface, limits: Limits, most: int) -> IntArray:
+    """The `most` flips that lower the squared error and limits most, to first order, in ascending order."""
+    error, beyond = _without(surface.rigid, surface.error), np.maximum(limits.values, 0)
+    promise, _ = _seen(lin, loads, _gradients(surface, limits, error[:, None], beyond[:, None]))
+    return np.sort(np.argsort(promise[:, 0], kind="stable")[:most])
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,6 +350,13 @@ class Gradients:
     x: FloatArray
     f: FloatArray
     y: FloatArray
+
+
+def _gradients(surface: _Surface, limits: Limits, of_shape: FloatArray, of_limits: FloatArray) -> Gradients:
+    """Of q measures of the shape (s, q) and of the limits (l, q) together."""
+    y = np.zeros((surface.n_dofs, of_shape.shape[1]))
+    y[surface.dofs] = surface.root[:, None] * of_shape
+    return Gradients(limits.rows_x.T @ of_limits, limits.rows_f.T @ of_limits, y)
 
 
 def _seen(lin: Linearisation, loads: FlipLoads, gradients: Gradients) -> tuple[FloatArray, FloatArray]:
