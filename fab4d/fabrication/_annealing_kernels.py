@@ -33,12 +33,14 @@ class Squares(NamedTuple):
     """`annealing.Energy` as the kernel changes it: error (p,) and beyond (l,) at the present labels.
 
     gram (k, k) : scalar products of the changes; of size 0 where they are too many to be kept
+    own (k,) : those of each change with itself
     slope (k,) : scalar products of the changes with the error, where there is a gram
     """
 
     error: FloatArray
     changes: FloatArray
     gram: FloatArray
+    own: FloatArray
     slope: FloatArray
     beyond: FloatArray
     limit_changes: FloatArray
@@ -69,7 +71,7 @@ def _rise(move: IntArray, flipped: BoolArray, squares: Squares, price_of: FloatA
     """By how much the squares of the error and the prices grow with flips of one or two candidates."""
     rise = 0.0
     for k in move:
-        rise += _product(k, k, squares) + _sign(k, flipped) * (2 * _slope(k, squares) + price_of[k])
+        rise += squares.own[k] + _sign(k, flipped) * (2 * _slope(k, squares) + price_of[k])
     if len(move) == 2:
         rise += 2 * _sign(move[0], flipped) * _sign(move[1], flipped) * _product(move[0], move[1], squares)
     return rise

@@ -64,7 +64,7 @@ Annealed = Callable[[BoolArray, Energy, float, int, int], BoolArray]
 
 
 def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
-    """A function that finds the labels (m,) of least energy near given ones, no boundary pinched anew.
+    """A function that finds the labels (m,) of least energy near given ones, the boundary pinched no more than there.
 
     The tables of the mesh `tets` (m, 4) are built once. volumes (m,)
     """
@@ -101,9 +101,8 @@ def _candidates(tets: IntArray, neighbours: IntArray, volumes: FloatArray) -> Ca
 
 
 def _squares(energy: Energy) -> Squares:
-    few = len(energy.tets) <= MOST_PRODUCTS
-    gram = energy.changes @ energy.changes.T if few else np.zeros((0, 0))
-    slope = energy.changes @ energy.error
     changes = np.ascontiguousarray(energy.changes, dtype=np.float64)
+    gram = changes @ changes.T if len(changes) <= MOST_PRODUCTS else np.zeros((0, 0))
+    own, slope = np.einsum("kp,kp->k", changes, changes), changes @ energy.error
     limit_changes = np.ascontiguousarray(energy.limit_changes, dtype=np.float64)
-    return Squares(energy.error.copy(), changes, gram, slope, energy.beyond.copy(), limit_changes)
+    return Squares(energy.error, changes, gram, own, slope, energy.beyond, limit_changes)
