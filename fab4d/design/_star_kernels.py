@@ -61,27 +61,6 @@ def between(nodes, indptr, indices, data, local):
 
 
 @njit(cache=True, nogil=True, fastmath=_SUMS)
-def cholesky(K):
-    """Overwrites the lower triangle of K (n, n) with its Cholesky factor; False where K is not positive definite."""
-    n = K.shape[0]
-    first = np.zeros(n, np.int64)
-    for i in range(n):
-        while K[i, first[i]] == 0.0 and first[i] < i:
-            first[i] += 1
-        for j in range(first[i], i + 1):
-            value = K[i, j]
-            for k in range(max(first[i], first[j]), j):
-                value -= K[i, k] * K[j, k]
-            if j < i:
-                K[i, j] = value / K[j, j]
-            elif value > 0.0:
-                K[i, i] = np.sqrt(value)
-            else:
-                return False
-    return True
-
-
-@njit(cache=True, nogil=True, fastmath=_SUMS)
 def solve(L, b):
     """Overwrites b (n,) with (L L^T)^-1 b."""
     n = len(b)

@@ -199,15 +199,17 @@ def _compliances(around: list[_Around]) -> FloatArray:
 
 
 def _factored(nodes: IntArray, K: FloatArray, free: FloatArray) -> _Around:
-    L = K.copy()
-    if star_kernels.cholesky(L):
-        corner = np.tril(L[-len(free) :, -len(free) :])
-        compliance = np.linalg.inv(corner @ corner.T)
-        solve: Callable[[FloatArray], FloatArray] = partial(_solved, L)
-    else:  # with all others held the shape is still not stable
+    solve: Callable[[FloatArray], FloatArray]
+    try:
+        L = np.asarray(np.linalg.cholesky(K), np.float64)
+    except np.linalg.LinAlgError:  # with all others held the shape is still not stable
         inverse = np.linalg.inv(K + np.tril(K, -1).T)
         compliance = inverse[-len(free) :, -len(free) :]
         solve = inverse.__matmul__
+    else:
+        corner = L[-len(free) :, -len(free) :]
+        compliance = np.linalg.inv(corner @ corner.T)
+        solve = partial(_solved, L)
     return _Around(nodes, solve, free, free[:, None] * compliance * free)
 
 
