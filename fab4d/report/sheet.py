@@ -219,11 +219,9 @@ def _views_large(page: Page, plan: RigPlan, figure: Figure, height: float) -> No
     """Two rows: the top view over the front view, the side view beside the front view, at one scale."""
     top, front, side = (fitted(frame, figure.X, figure.x) for frame in FRAMES)
     margins = 2 * VIEW_MARGIN
-    scale = min(
-        (FULL - 2 * margins) / (front.size[0] + side.size[0]),
-        (height - 2 * margins - 8) / (top.size[1] + front.size[1]),
-    )
-    left = max(top.size[0], front.size[0]) * scale + margins
+    columns = [max(top.size[0], front.size[0]), side.size[0]]
+    scale = _row_scale(columns, (height - 2 * margins - 8) / (top.size[1] + front.size[1]))
+    left, _ = _column_widths(columns, scale)
     low = max(front.size[1], side.size[1]) * scale + margins + 4
     high = top.size[1] * scale + margins + 4
     page.y -= high

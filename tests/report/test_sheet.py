@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reportlab.pdfgen.canvas import Canvas
 
 from fab4d.io.cards import load_printer
 from fab4d.mesh.topology import face_table
@@ -227,6 +228,22 @@ def test_views_in_a_row_fit_the_page_at_the_largest_scale_that_does(sizes: list[
     assert 0 < scale <= 2.0
     assert sum(sheet._column_widths(sizes, scale)) <= sheet.FULL
     assert scale == 2.0 or sum(sheet._column_widths(sizes, 1.03 * scale)) > sheet.FULL
+
+
+@pytest.mark.parametrize("extents", [(150.0, 20, 6), (10, 10, 150), (20, 150, 10), (80, 80, 80), (4000, 3, 3)])
+def test_views_in_two_rows_and_their_titles_stay_on_the_page(
+    extents: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shape, rooms = np.vstack([np.zeros(3), extents]), list[tuple[float, float, float, float]]()
+    none = np.zeros((0, 3), np.int64)
+    monkeypatch.setattr(sheet, "draw_view", lambda *seen: rooms.append(seen[4]))
+    page = sheet.Page(Canvas(io.BytesIO()), sheet.HEIGHT - sheet.MARGIN)
+    sheet._views_large(page, None, Figure(shape, shape, none, none, none), 168.0)
+    assert len(rooms) == 3
+    for left, bottom, width, _ in rooms:
+        assert width >= sheet.TITLE_WIDTH
+        assert left + width <= sheet.MARGIN + sheet.FULL + 1e-9
+        assert bottom >= sheet.HEIGHT - sheet.MARGIN - 168.0 - 1e-9
 
 
 @pytest.mark.parametrize("end", [(40.0, 0.0), (0.0, 40.0)])
