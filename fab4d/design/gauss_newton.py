@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -23,6 +24,7 @@ from fab4d.design.objective import (
 )
 from fab4d.design.sensitivity import Change, Linearisation, linearise
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
+from fab4d.solvers.threads import first_found
 
 # Relative residual at which an iterate counts as in equilibrium; the delivered state is solved to rounding.
 SEARCH_TOLERANCE = 1e-6
@@ -292,20 +294,27 @@ def gauss_newton_step(
     """
     value = evaluate(equilibria, weights, L, design)
     model = build_model(equilibria, weights, L, design)
-    for attempt in range(tries):
+
+    def tried(damping: float) -> tuple[Design, float] | None:
         damped = model.damped(damping, equilibria.problem.volume_fractions)
         drho = _density_step(damped, design.rho, movable)
         dc = damped.held_step(drho)
         # The model falls by this at most: its quadratic part takes some of it back.
         promised = -float(model.gradient_rho @ drho + model.gradient_c @ dc.ravel())
-        rho = np.clip(design.rho + drho, 0, 1)
-        trial = _trial(equilibria, model, design, rho, dc, stay) if promised > least_promise * value else None
-        if trial is not None:
-            new = evaluate(equilibria, weights, L, trial)
-            if new < value:
-                return Step(trial, new, damping / SOFTER if attempt == 0 else damping, True)
-        damping *= STIFFER
-    return Step(design, value, damping, False)
+        if promised <= least_promise * value:
+            return None
+        trial = _trial(equilibria, model, design, np.clip(design.rho + drho, 0, 1), dc, stay)
+        if trial is None:
+            return None
+        new = evaluate(equilibria, weights, L, trial)
+        return (trial, new) if new < value else None
+
+    dampings = np.cumprod([damping] + tries * [STIFFER])
+    found = first_found([partial(tried, each) for each in dampings[:-1]], 3 * equilibria.problem.n_nodes)
+    if found is None:
+        return Step(design, value, dampings[-1], False)
+    attempt, (trial, new) = found
+    return Step(trial, new, damping / SOFTER if attempt == 0 else dampings[attempt], True)
 
 
 def evaluate(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, design: Design) -> float:

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from fab4d.design.sensitivity import Linearisation
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.measures import deformation_gradients
 from fab4d.mesh.rigid import best_rigid_motion
+from fab4d.solvers import threads
 from fab4d.solvers.newton import Solution, Status
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3, lam_SMP=0.05, lam_smooth=0.3)
@@ -430,6 +432,39 @@ def test_no_step_gains_more_than_it_promises(truth: Truth, damping: float) -> No
     never = gauss_newton.gauss_newton_step(equilibria, weights, L, design, damping, None, 1, 2.5 * share)
     assert again.accepted
     assert not never.accepted
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2, 6])
+def test_a_step_is_the_same_on_one_core_and_on_two(truth: Truth, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
+    """Where tries fail, here those that move held positions far, the next counts and tells the later damping."""
+    weights, L, trial, moved = (
+        WEIGHTS.replace(error_scale=0.1),
+        smoothness_matrix(truth.problem),
+        gauss_newton._trial,
+        [],
+    )
+
+    def step(cores: int, farthest: float) -> gauss_newton.Step:
+        def near(*given: Any, **named: Any) -> Design | None:
+            moved.append(float(np.linalg.norm(given[4])))
+            return trial(*given, **named) if moved[-1] <= farthest else None
+
+        monkeypatch.setattr(threads, "usable_cores", lambda: cores)
+        monkeypatch.setattr(gauss_newton, "_trial", near)
+        return gauss_newton.gauss_newton_step(truth.equilibria, weights, L, truth.design, 1.0, tries=6)
+
+    assert not step(1, 0.0).accepted
+    farthest = np.append(moved, 0.0)[failing]
+    assert (np.diff(moved) < 0).all()
+    one, two = step(1, farthest), step(2, farthest)
+    assert one.accepted == two.accepted == (failing < 6)
+    assert (
+        one.damping
+        == two.damping
+        == pytest.approx(gauss_newton.STIFFER**failing if failing else 1 / gauss_newton.SOFTER)
+    )
+    np.testing.assert_allclose(one.design.median.x, two.design.median.x, atol=1e-12)
+    np.testing.assert_allclose(one.design.rho, two.design.rho, atol=1e-12)
 
 
 def test_a_step_is_taken_though_it_is_predicted_to_turn_tets_over(

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from fab4d.solvers import threads
-from fab4d.solvers.threads import THREADED_FROM, side_by_side
+from fab4d.solvers.threads import THREADED_FROM, first_found, side_by_side
 
 
 @pytest.fixture
@@ -101,3 +101,45 @@ for _ in range(20):
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("place", range(5))
+def test_of_tries_the_first_that_succeeds_counts_on_any_number_of_cores(cores, count, place):
+    cores(count)
+    tries = [lambda k=k: str(k) if k >= place else None for k in range(5)]
+    assert first_found(tries, 1) == (place, str(place))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_tries_of_which_none_succeeds_find_nothing(cores, count):
+    cores(count)
+    assert first_found([lambda: None] * 3, 1) is None
+    assert first_found([], 1) is None
+
+
+def test_the_next_try_is_made_with_the_first_where_a_core_is_free(cores):
+    made, both = [], threading.Barrier(2, timeout=10)
+
+    def tried(k: int) -> int:
+        made.append(k)
+        if max(made) < 2 and not alone:
+            both.wait()  # is passed only if the other waits too
+        return k
+
+    for alone, count, unknowns in ((False, 2, 1), (True, 1, 1), (True, 2, THREADED_FROM)):
+        cores(count)
+        made.clear()
+        assert first_found([lambda k=k: tried(k) for k in range(4)], unknowns) == (0, 0)
+        assert sorted(made) == ([0] if alone else [0, 1])
+
+
+def test_what_a_try_raises_counts_unless_one_before_it_succeeds(cores):
+    cores(2)
+
+    def fails() -> int | None:
+        raise ZeroDivisionError
+
+    assert first_found([lambda: 1, fails], 1) == (0, 1)
+    with pytest.raises(ZeroDivisionError):
+        first_found([lambda: None, fails, lambda: 1], 1)
