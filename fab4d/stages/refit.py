@@ -47,6 +47,9 @@ LOW_ERROR = 0.15
 WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
 FEW_STEPS = 3
+# Errors that are predicted for printed labels differ from what comes of them by up to this factor more for one than for
+# another.
+CLEARLY_WORSE = 1.1
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
 Polish = Callable[[Equilibria, Design], Design]
@@ -143,19 +146,22 @@ def _ways(
     """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
 
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
-    changes. What is predicted to be no better than what was found is left out.
+    changes. What is predicted to be no better than what was found, or clearly worse than what was predicted of another
+    that was followed, is left out.
     """
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
-    best = np.inf
+    best = promised = np.inf
     for labels in _repairs(equilibria.problem, flips, rounded, smp, settings):
-        left = -np.inf if flips is None else error_left(flips, rounded, labels)
-        if left >= best or any((labels == other).all() for other in tried):
+        left = 0.0 if flips is None else error_left(flips, rounded, labels)
+        worse = left >= best or left > CLEARLY_WORSE * promised
+        if worse or any((labels == other).all() for other in tried):
             continue
         tried.append(labels)
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
         if followed is not None:
             best = min(best, shape_error(equilibria.problem, followed.fitted.final.y).rms)
+            promised = min(promised, left)
         yield followed
 
 
@@ -165,9 +171,8 @@ def _repairs(
     """Printable labels near `rounded` (m,): smp (m,) and, where it is known what flips do, others."""
     if flips is not None:
         yield compensated(problem, flips, rounded, smp, settings)
-    yield smp
-    if flips is not None:
         yield mended(problem, flips, rounded, settings)
+    yield smp
 
 
 def _followed(
