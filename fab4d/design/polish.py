@@ -34,8 +34,9 @@ MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 6
 # Moves of the held positions cost HELD_BACK times as much after flips whose equilibria are not found, for these mostly
 # lie too far off, and LET_GO times less after flips that come true. Beyond MOST_DAMPING it is not for these moves.
 LET_GO, MOST_DAMPING = 3.0, 1e3
-# Steps of the held positions after each round; once all are made, they are fitted to the end.
-FOLLOWING_STEPS = 6
+# Steps of the held positions after each round, and the share of the objective by which one has to promise to lower it;
+# once all rounds are made, they are fitted to the end.
+FOLLOWING_STEPS, FOLLOWING_PROMISE = 6, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ def _after_round(
     if trial is None:
         poor, damping = at.poor + (at.damping >= MOST_DAMPING), HELD_BACK * at.damping
         return replace(at, found=found.damped(HELD_BACK), price=DEARER * at.price, damping=damping, poor=poor)
-    fitted = refit(equilibria, trial, plain, lambda at: None, iterations=FOLLOWING_STEPS)  # noqa: ARG005
+    fitted = refit(equilibria, trial, plain, lambda at: None, FOLLOWING_STEPS, FOLLOWING_PROMISE)  # noqa: ARG005
     value, new_rms = _objective(equilibria, plain, fitted), shape_error(problem, fitted.final.y).rms
     far = rms <= settings.tolerance and _rounds_to_go(rms, new_rms, settings.target_rms) > MOST_TO_GO
     poor = at.poor + 1 if far or value > (1 - LEAST_ROUND_GAIN) * at.value else 0

@@ -395,16 +395,24 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
 
 
 def refit(
-    equilibria: Equilibria, design: Design, weights: ObjectiveWeights, watch: Watch, iterations: int = 12
+    equilibria: Equilibria,
+    design: Design,
+    weights: ObjectiveWeights,
+    watch: Watch,
+    iterations: int = 12,
+    least_promise: float = LEAST_PROMISE,
 ) -> Design:
-    """Held positions that are best for the design's fixed density; the density does not move."""
+    """Held positions that are best for the design's fixed density; the density does not move.
+
+    least_promise : share of the objective by which a step has to promise to lower it
+    """
     problem = equilibria.problem
     weights = weights.of_fixed_density()
     L = smoothness_matrix(problem)
     fixed = np.zeros(problem.n_tets, bool)
     damping, value = FIRST_DAMPING, evaluate(equilibria, weights, L, design)
     for _ in range(iterations):
-        step = gauss_newton_step(equilibria, weights, L, design, damping, fixed, REFIT_TRIES, LEAST_PROMISE)
+        step = gauss_newton_step(equilibria, weights, L, design, damping, fixed, REFIT_TRIES, least_promise)
         if not step.accepted:
             break
         slow = step.value > (1 - SLOW_REFIT) * value
