@@ -9,9 +9,11 @@ from fab4d.fabrication._links import Links
 from fab4d.mesh.tetmesh import BoolArray, FloatArray, IntArray
 
 # Loops instead of sums, copies and assignments of slices: numba's code for these takes long to compile.
-# Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile.
-_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_inner = njit(cache=True, **_NO_ENTRY)
+# Functions that only compiled ones call need no entry from Python: with so many arrays it takes long to compile. Nor do
+# they count references to these arrays, which takes longer than what many of them do, most of all where two threads
+# count the same (numba issue 2345): so they may make no arrays and return none.
+ONLY_INSIDE: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+_inner = njit(cache=True, **ONLY_INSIDE)
 FREE, LOCK_STEPS, LIMITLESS = -1, 12, 1 << 40
 EACH_TET, WHOLE_STAR = -2, -1
 
@@ -67,7 +69,7 @@ def _boundary_excess(v: int, value: bool, links: Links, scratch: Scratch) -> int
         parent[i] = i
     touched = joined = excess = 0
     for e in range(links.edge_start[v], links.edge_start[v + 1]):
-        a, b = links.edge_tets[e]
+        a, b = links.edge_tets[e, 0], links.edge_tets[e, 1]
         if (bits[a] == value) != (b >= 0 and bits[b] == value):
             i, j = links.edge_ends[e]
             touched += (degree[i] == 0) + (degree[j] == 0)
@@ -128,7 +130,7 @@ def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
         group[k] = -1 if node >= 0 else 0
     for e in range(links.edge_start[v], links.edge_start[v + 1]):
         if node < 0 or links.edge_ends[e, 0] == node or links.edge_ends[e, 1] == node:
-            a, b = links.edge_tets[e]
+            a, b = links.edge_tets[e, 0], links.edge_tets[e, 1]
             group[a] = 0
             if b >= 0:
                 group[b] = 0
