@@ -29,8 +29,8 @@ CAME_TRUE, CAME_TO_LITTLE = 0.6, 0.3
 # A round has to lower the predicted squared error, and the objective, by this share.
 LEAST_ROUND_GAIN = 2e-2
 # So many rounds in a row that gain less end it. Once the tolerance is met, a round is also poor after which the target
-# is more than MOST_TO_GO such rounds away, and fewer end it.
-MOST_POOR, POOR_AFTER, MOST_TO_GO = 3, 2, 6
+# is more than MOST_TO_GO such rounds away.
+MOST_POOR, MOST_TO_GO = 3, 6
 # Moves of the held positions cost HELD_BACK times as much after flips whose equilibria are not found, for these mostly
 # lie too far off, and LET_GO times less after flips that come true. Beyond MOST_DAMPING it is not for these moves.
 LET_GO, MOST_DAMPING = 3.0, 1e3
@@ -118,9 +118,7 @@ def _objective(equilibria: Equilibria, weights: ObjectiveWeights, design: Design
 
 def _most_poor(settings: FlipSettings, rms: float) -> int:
     """So many poor rounds in a row end the flips at this RMS error, L0."""
-    if rms <= settings.low_rms:
-        return 1
-    return POOR_AFTER if rms <= settings.tolerance else MOST_POOR
+    return 1 if rms <= settings.low_rms else MOST_POOR
 
 
 def _rounds_to_go(before: float, after: float, target: float) -> float:
