@@ -30,38 +30,22 @@ class Candidates(NamedTuple):
 class Squares(NamedTuple):
     """`annealing.Energy` as the kernel changes it: error (p,) and beyond (l,) at the present labels.
 
-    gram (k, k) : scalar products of the changes; of size 0 where they are too many to be kept
-    own (k,) : those of each change with itself
-    slope (k,) : scalar products of the changes with the error, where there is a gram
+    own (k,) : scalar products of each change with itself
     """
 
     error: FloatArray
     changes: FloatArray
-    gram: FloatArray
     own: FloatArray
-    slope: FloatArray
     beyond: FloatArray
     limit_changes: FloatArray
 
 
 @_sums
-def _product(k: int, j: int, squares: Squares) -> float:
-    if squares.gram.size:
-        return squares.gram[k, j]
+def _product(a: FloatArray, b: FloatArray) -> float:
     product = 0.0
-    for i in range(len(squares.error)):
-        product += squares.changes[k, i] * squares.changes[j, i]
+    for i in range(len(a)):
+        product += a[i] * b[i]
     return product
-
-
-@_sums
-def _slope(k: int, squares: Squares) -> float:
-    if squares.gram.size:
-        return squares.slope[k]
-    slope = 0.0
-    for i in range(len(squares.error)):
-        slope += squares.changes[k, i] * squares.error[i]
-    return slope
 
 
 @_inner
@@ -69,9 +53,10 @@ def _rise(move: IntArray, flipped: BoolArray, squares: Squares, price_of: FloatA
     """By how much the squares of the error and the prices grow with flips of one or two candidates."""
     rise = 0.0
     for k in move:
-        rise += squares.own[k] + _sign(k, flipped) * (2 * _slope(k, squares) + price_of[k])
+        rise += squares.own[k] + _sign(k, flipped) * (2 * _product(squares.changes[k], squares.error) + price_of[k])
     if len(move) == 2:
-        rise += 2 * _sign(move[0], flipped) * _sign(move[1], flipped) * _product(move[0], move[1], squares)
+        product = _product(squares.changes[move[0]], squares.changes[move[1]])
+        rise += 2 * _sign(move[0], flipped) * _sign(move[1], flipped) * product
     return rise
 
 
@@ -94,12 +79,8 @@ def _sign(k: int, flipped: BoolArray) -> float:
 
 @_inner
 def _take(k: int, sign: float, squares: Squares) -> None:
-    if squares.gram.size:
-        for j in range(len(squares.slope)):
-            squares.slope[j] += sign * squares.gram[k, j]
-    else:
-        for i in range(len(squares.error)):
-            squares.error[i] += sign * squares.changes[k, i]
+    for i in range(len(squares.error)):
+        squares.error[i] += sign * squares.changes[k, i]
     for i in range(len(squares.beyond)):
         squares.beyond[i] += sign * squares.limit_changes[k, i]
 

@@ -69,7 +69,7 @@ def _boundary_excess(v: int, value: bool, links: Links, scratch: Scratch) -> int
         parent[i] = i
     touched = joined = excess = 0
     for e in range(links.edge_start[v], links.edge_start[v + 1]):
-        a, b = links.edge_tets[e, 0], links.edge_tets[e, 1]
+        a, b = links.edge_tets[e]
         if (bits[a] == value) != (b >= 0 and bits[b] == value):
             i, j = links.edge_ends[e]
             touched += (degree[i] == 0) + (degree[j] == 0)
@@ -130,7 +130,7 @@ def _group_tets(v: int, node: int, links: Links, scratch: Scratch) -> None:
         group[k] = -1 if node >= 0 else 0
     for e in range(links.edge_start[v], links.edge_start[v + 1]):
         if node < 0 or links.edge_ends[e, 0] == node or links.edge_ends[e, 1] == node:
-            a, b = links.edge_tets[e, 0], links.edge_tets[e, 1]
+            a, b = links.edge_tets[e]
             group[a] = 0
             if b >= 0:
                 group[b] = 0

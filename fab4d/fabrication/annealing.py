@@ -26,8 +26,6 @@ HOT, COLD = (3e-3, 1e-2, 3e-2), 1e-5
 # What each pinched place costs on the way, in first temperatures: for less too many are left in the end, for more few
 # flips are made that others have to follow.
 PINCHED = 6.0
-# Scalar products of the changes of so many tets are kept at most; of more they are worked out each time.
-MOST_PRODUCTS = 4000
 # More steps than these take minutes.
 MOST_STEPS = 20_000_000
 
@@ -78,7 +76,7 @@ def annealer(tets: IntArray, volumes: FloatArray) -> Annealed:
         most = min(steps * len(energy.tets), MOST_STEPS)
 
         def from_temperature(hot: float, random: np.random.Generator) -> tuple[float, BoolArray]:
-            changed = squares._replace(**{name: getattr(squares, name).copy() for name in ("error", "slope", "beyond")})
+            changed = squares._replace(error=squares.error.copy(), beyond=squares.beyond.copy())
             temperatures = hot * start, COLD * start
             prices = energy.price + energy.doubts, energy.defect_price, PINCHED * hot * start
             work = deepcopy(scratch)
@@ -102,7 +100,6 @@ def _candidates(tets: IntArray, neighbours: IntArray, volumes: FloatArray) -> Ca
 
 def _squares(energy: Energy) -> Squares:
     changes = np.ascontiguousarray(energy.changes, dtype=np.float64)
-    gram = changes @ changes.T if len(changes) <= MOST_PRODUCTS else np.zeros((0, 0))
-    own, slope = np.einsum("kp,kp->k", changes, changes), changes @ energy.error
+    own = np.einsum("kp,kp->k", changes, changes)
     limit_changes = np.ascontiguousarray(energy.limit_changes, dtype=np.float64)
-    return Squares(energy.error, changes, gram, own, slope, energy.beyond, limit_changes)
+    return Squares(energy.error, changes, own, energy.beyond, limit_changes)

@@ -437,12 +437,8 @@ def test_no_step_gains_more_than_it_promises(truth: Truth, damping: float) -> No
 @pytest.mark.parametrize("failing", [0, 1, 2, 6])
 def test_a_step_is_the_same_on_one_core_and_on_two(truth: Truth, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
     """Where tries fail, here those that move held positions far, the next counts and tells the later damping."""
-    weights, L, trial, moved = (
-        WEIGHTS.replace(error_scale=0.1),
-        smoothness_matrix(truth.problem),
-        gauss_newton._trial,
-        [],
-    )
+    weights, L = WEIGHTS.replace(error_scale=0.1), smoothness_matrix(truth.problem)
+    trial, moved = gauss_newton._trial, list[float]()
 
     def step(cores: int, farthest: float) -> gauss_newton.Step:
         def near(*given: Any, **named: Any) -> Design | None:
@@ -458,11 +454,8 @@ def test_a_step_is_the_same_on_one_core_and_on_two(truth: Truth, monkeypatch: py
     assert (np.diff(moved) < 0).all()
     one, two = step(1, farthest), step(2, farthest)
     assert one.accepted == two.accepted == (failing < 6)
-    assert (
-        one.damping
-        == two.damping
-        == pytest.approx(gauss_newton.STIFFER**failing if failing else 1 / gauss_newton.SOFTER)
-    )
+    assert one.damping == two.damping
+    assert one.damping == pytest.approx(gauss_newton.STIFFER**failing if failing else 1 / gauss_newton.SOFTER)
     np.testing.assert_allclose(one.design.median.x, two.design.median.x, atol=1e-12)
     np.testing.assert_allclose(one.design.rho, two.design.rho, atol=1e-12)
 

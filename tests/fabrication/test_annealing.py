@@ -155,16 +155,6 @@ def test_past_pinched_labels_there_is_less_energy(meshes, monkeypatch):
     assert np.mean(past) < 0.95 * np.mean(found())
 
 
-def test_products_that_are_kept_and_those_worked_out_each_time_come_to_the_same(meshes, monkeypatch):
-    tets, volumes, smp = case(meshes, 3)
-    energy = energy_by_chance(np.arange(len(tets)), 3)
-    annealed = annealer(tets, volumes)
-    kept = annealed(smp, energy, 1.0, 200, 1)
-    monkeypatch.setattr(annealing, "MOST_PRODUCTS", 0)
-    np.testing.assert_array_equal(annealed(smp, energy, 1.0, 200, 1), kept)
-    assert (kept != smp).any()
-
-
 def test_there_is_an_end_to_the_steps(meshes, monkeypatch):
     tets, volumes, smp = case(meshes, 3)
     monkeypatch.setattr(annealing, "MOST_STEPS", 0)

@@ -103,6 +103,26 @@ for _ in range(20):
     assert done.returncode == 0, done.stderr
 
 
+def test_blas_keeps_to_one_thread_beside_ours():
+    """In a process of its own: the threads of this one are made once."""
+    code = """
+import scipy.linalg
+from threadpoolctl import threadpool_info, threadpool_limits
+from fab4d.solvers import threads
+
+def blas():
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+threads.usable_cores = lambda: 2
+threadpool_limits(2, user_api="blas")
+before = blas()
+threads.side_by_side([int, int], 1)
+print(before, blas())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "{2} {1}", done.stderr
+
+
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("place", range(5))
 def test_of_tries_the_first_that_succeeds_counts_on_any_number_of_cores(cores, count, place):
