@@ -351,11 +351,17 @@ def _direction(text: str) -> tuple[float, float, float]:
 def slice_command(scene: Path, out: Path | None, slicer: str | None, quiet: bool) -> None:
     from fab4d.errors import SliceError
     from fab4d.io.slicers import find_slicer
+    from fab4d.runner.runner import Selection, execute
     from fab4d.runner.summary import slice_lines
+    from fab4d.runner.workspace import Workspace
     from fab4d.stages.slice import slice_report
 
-    program = find_slicer(slicer)
-    workspace = _with_bodies(scene, out, quiet)
+    workspace = Workspace(scene, stage_table().artifacts)
+    job = None if workspace.exists("bodies_report") else _open_job(scene, out)
+    program = find_slicer(slicer)  # before bodies are made, which may take minutes
+    if job is not None:
+        execute(job, Selection(last="bodies"), _display(quiet))
+        workspace = job.workspace
     with workspace.locked():
         reads = stage_table().stage("slice").reads
         inputs = {name: workspace.load(name) if workspace.exists(name) else None for name in reads}
@@ -376,19 +382,6 @@ def _refuse_missing_files(workspace: "Workspace", inputs: Mapping[str, Any]) -> 
         if inputs[name] is None:
             msg = f"{workspace.path(name)} is missing: make it again with `fab4d bodies SCENE --force`"
             raise ArtifactError(msg)
-
-
-def _with_bodies(path: Path, out: Path | None, quiet: bool) -> "Workspace":
-    """The run folder `path`, or that of the scene `path` with its bodies made."""
-    from fab4d.runner.runner import Selection, execute
-    from fab4d.runner.workspace import Workspace
-
-    workspace = Workspace(path, stage_table().artifacts)
-    if workspace.exists("bodies_report"):
-        return workspace
-    job = _open_job(path, out)
-    execute(job, Selection(last="bodies"), _display(quiet))
-    return job.workspace
 
 
 for _stage in stage_table().between("rig", None):

@@ -14,6 +14,8 @@ from fab4d.io.cards import load_printer
 from fab4d.io.meshes import write_vtu
 from fab4d.io.slicers import Slice, Slicer, filament_length
 
+STRIP = Path(__file__).parents[2] / "samples" / "strip"
+
 
 def fab4d(*arguments: Any) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
@@ -96,10 +98,13 @@ def test_a_slice_of_other_volumes_ends_with_10(
 
 
 def test_without_a_slicer_it_ends_with_9(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the bodies are made; what is wrong with the scene is told first."""
     monkeypatch.setenv("PATH", str(mesh.parent))
-    result = fab4d("slice", "no-scene")
+    result = fab4d("slice", STRIP)
     assert result.exit_code == 9
     assert "install PrusaSlicer" in result.stderr
+    assert not Path("runs").exists()
+    assert fab4d("slice", "no-scene").exit_code == 3
 
 
 def test_what_is_no_run_is_taken_for_a_scene(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
