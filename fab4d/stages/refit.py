@@ -8,7 +8,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.exchange import held_apart
-from fab4d.design.finish import carried_over
+from fab4d.design.finish import carried_in, carried_over
 from fab4d.design.flips import FlipSettings, compensated, error_left, mended, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design, build_model
@@ -28,7 +28,7 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
-from fab4d.stages._element import element_for
+from fab4d.stages._element import elements_for
 from fab4d.stages._repair import influence_near
 from fab4d.stages.monitor import Monitor
 from fab4d.stages.threshold import labels_for
@@ -39,7 +39,8 @@ MOST_FITS = 3
 # that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
-# So they do where the relaxed design is out of reach of the tolerance.
+# So they do where the relaxed design is out of reach of the tolerance, and in quadratic elements that are too many to
+# round in: there the first is the tolerance itself.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
 # At this share of the tolerance flips end with the first round that gains little.
 LOW_ERROR = 0.15
@@ -52,15 +53,18 @@ FEW_STEPS = 3
 CLEARLY_WORSE = 1.1
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
+NOT_HELD = "the design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
 Polish = Callable[[Equilibria, Design], Design]
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
-    element, left_out = element_for(mesh, profile["solver"].element)
-    problem = problem_of(mesh, profile["materials"], element)
-    equilibria = Equilibria(problem, patches_of(problem, relaxed))
+    elements = elements_for(mesh, profile["solver"].element)
+    rounding, problem = (
+        problem_of(mesh, profile["materials"], element) for element in (elements.rounding, elements.last_fit)
+    )
+    equilibria = Equilibria(rounding, patches_of(rounding, relaxed))
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
@@ -71,8 +75,14 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     trace.add("refit", Search(equilibria, design))
     fit = _Fit(equilibria, design)
     if equilibria.patches.count:
-        radius = float(relaxed["patch_radius"]) / problem.length
-        fit = _reachable_fit(equilibria, design, weights, radius, _polish(weights, settings, trace), trace)
+        radius, polish = float(relaxed["patch_radius"]) / problem.length, _polish(weights, settings, trace)
+        if elements.last_fit != elements.rounding:
+            design = polish(equilibria, refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
+            carried = _in_elements_of(problem, Search(equilibria, design))
+            trace.add("carried over", carried)
+            equilibria, design = carried.equilibria, carried.design
+            polish = _polish(weights, replace(settings, target_rms=weights.error_scale, rounds=FEW_ROUNDS), trace)
+        fit = _reachable_fit(equilibria, design, weights, radius, polish, trace)
     equilibria, smp = fit.equilibria, fit.design.rho > 0.5
     design = polished(equilibria, fit.design)
     trace.add("refit", Search(equilibria, design))
@@ -85,7 +95,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "fits": fit.fits,
         "flipped_fraction": float(problem.volume_fractions[smp != rounded["smp"]].sum()),
         "reasons": reasons,
-        "left_out": left_out,
+        "left_out": elements.left_out,
     }
     return {
         "labels": {"smp": smp, "cluster": smp_clusters(mesh["tets"], volumes, smp)},
@@ -324,15 +334,25 @@ def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Go
 
 
 def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:
-    """The relaxed design in equilibrium for the elements of the fit.
+    """The relaxed design in equilibrium for the elements of the rounding.
 
     Raises EquilibriumError where these find no equilibrium near it.
     """
     design = _carried(equilibria, relaxed, relaxed["rho"])
     if design is None:
-        msg = "the relaxed design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
-        raise EquilibriumError(msg)
+        raise EquilibriumError(NOT_HELD)
     return design
+
+
+def _in_elements_of(problem: Problem, at: Search) -> Search:
+    """A design in other elements of the same mesh.
+
+    Raises EquilibriumError where these find no equilibrium near it.
+    """
+    carried = carried_in(problem, at)
+    if carried is None:
+        raise EquilibriumError(NOT_HELD)
+    return carried
 
 
 def _carried(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], rho: FloatArray) -> Design | None:

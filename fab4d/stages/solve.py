@@ -19,7 +19,7 @@ from fab4d.io.scene import Goal, RigCard, Weights
 from fab4d.stages._bring_up import COARSE_SHARE, affordable, brought_up, far_off
 from fab4d.stages._coarse import MANY_TETS, coarse_for
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, problem_of, tau_seconds, tolerance_of
-from fab4d.stages._element import element_for
+from fab4d.stages._element import elements_for
 from fab4d.stages._least import RELAXED, least_smp
 from fab4d.stages._printed import as_printed, refitted_in
 from fab4d.stages._repair import MORE_REPAIRS, repaired
@@ -83,7 +83,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         return _artifacts(mesh, profile, rest, trace, {"tau_s": tau_s, "left_out": why})
     if inputs["picked"] is not None:
         return _picked(problem, inputs, profile, trace, tau_s)
-    element, _ = element_for(mesh, profile["solver"].element)
+    element = elements_for(mesh, profile["solver"].element).rounding
     designed = _designed_coarse(problem, mesh, profile, element, trace, monitor)
     if designed is None:
         found, _, report = _designed(problem, mesh, profile, element, trace, monitor)

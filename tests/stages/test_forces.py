@@ -128,26 +128,28 @@ def test_a_mesh_too_large_to_compare_is_left_out_and_that_is_said(
 
 
 @pytest.mark.parametrize(
-    ("wanted", "fine", "most", "element", "why"),
+    ("wanted", "fine", "rounded", "most", "elements", "why"),
     [
-        ("auto", 8.0, 10_000, "quadratic", None),
-        ("auto", 1.0, 10_000, "linear", "1 linear ones span the thinnest walls"),
-        ("auto", 8.0, 100, "linear", "unknowns take too long (at most 100)"),
-        ("linear", 8.0, 10_000, "linear", "the scene asks for linear ones"),
-        ("quadratic", 1.0, 100, "quadratic", None),
+        ("auto", 8.0, 10_000, 10_000, ("quadratic", "quadratic"), None),
+        ("auto", 1.0, 10_000, 10_000, ("linear", "linear"), "1 linear ones span the thinnest walls"),
+        ("auto", 8.0, 100, 10_000, ("linear", "quadratic"), "unknowns take too long (at most 100)"),
+        ("auto", 8.0, 10, 100, ("linear", "linear"), "unknowns take too long (at most 100)"),
+        ("linear", 8.0, 10_000, 10_000, ("linear", "linear"), "the scene asks for linear ones"),
+        ("quadratic", 1.0, 10, 100, ("quadratic", "quadratic"), None),
     ],
 )
-def test_the_element_of_the_last_fit(
+def test_the_elements_of_rounding_and_last_fit(
     cantilever: Arrays,
     wanted: str,
     fine: float,
+    rounded: int,
     most: int,
-    element: str,
+    elements: tuple[str, str],
     why: str | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(_element, "FINE_ELEMENTS", fine)
-    monkeypatch.setattr(_element, "MOST_QUADRATIC_DOFS", most)
-    found, left_out = _element.element_for(cantilever, wanted)
-    assert found == element
-    assert (left_out == []) if why is None else (why in left_out[0]["why"])
+    for name, value in (("FINE_ELEMENTS", fine), ("MOST_ROUNDED_DOFS", rounded), ("MOST_FITTED_DOFS", most)):
+        monkeypatch.setattr(_element, name, value)
+    found = _element.elements_for(cantilever, wanted)
+    assert (found.rounding, found.last_fit) == elements
+    assert (found.left_out == []) if why is None else (why in found.left_out[0]["why"])

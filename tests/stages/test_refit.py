@@ -24,7 +24,7 @@ from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
-from fab4d.stages import refit, solve, threshold
+from fab4d.stages import _element, refit, solve, threshold
 from fab4d.stages._design import objective_weights, patches_of, problem_of
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
@@ -45,11 +45,14 @@ def inputs() -> Artifacts:
     return {"mesh": mesh, "relaxed": relaxed, "rounded": rounded}
 
 
-@pytest.fixture(scope="module", params=["linear", "auto"])
+@pytest.fixture(scope="module", params=["linear", "auto", "too many to round"])
 def fitted(request: pytest.FixtureRequest, inputs: Artifacts) -> tuple[str, Artifacts]:
-    element = request.param
-    solver = SolverSettings(element=element)
-    return element, refit.run(inputs, PROFILE | {"solver": solver}, SilentMonitor())
+    element = "linear" if request.param == "linear" else "auto"
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "too many to round":
+            patch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
+        found = refit.run(inputs, PROFILE | {"solver": SolverSettings(element=element)}, SilentMonitor())
+    return request.param, found
 
 
 def errors(found: Artifacts) -> FloatArray:
@@ -68,7 +71,41 @@ def test_the_elements_are_those_asked_for(inputs: Artifacts, fitted: tuple[str, 
     order = equilibria_of(inputs, found).problem.body.order
     assert order == (1 if element == "linear" else 2)
     told = [item["what"] for item in found["refit_report"]["left_out"]]
-    assert told == (["quadratic elements"] if element == "linear" else [])
+    left_out = {"linear": ["quadratic elements"], "auto": [], "too many to round": ["rounding in quadratic elements"]}
+    assert told == left_out[element]
+
+
+def test_what_is_too_large_to_round_in_quadratic_elements_is_fitted_in_them(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Labels are flipped in linear elements, and in quadratic ones only while the tolerance is missed."""
+    targets = []
+
+    def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001
+        targets.append((equilibria.problem.body.order, settings.target_rms / weights.error_scale, settings.rounds))
+        return design
+
+    monkeypatch.setattr(refit, "polish_labels", spy)
+    monkeypatch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
+    found = refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
+    (first, target, many), *others = targets
+    assert first == 1
+    assert target == pytest.approx(1.15 * float(inputs["relaxed"]["relaxed_rms"]) / PROFILE["goal"].tolerance)
+    assert others
+    assert all(other == (2, 1.0, refit.FEW_ROUNDS) for other in others)
+    assert many > refit.FEW_ROUNDS
+    rows = list(csv.DictReader(io.StringIO(found["refit_trace"].decode())))
+    carried = next(k for k, row in enumerate(rows) if row["phase"] == "carried over")
+    assert float(rows[-1]["rms_mm"]) < 0.9 * float(rows[carried]["rms_mm"])
+
+
+def test_a_design_that_quadratic_elements_do_not_hold_is_told(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refit, "carried_in", lambda *_: None)
+    monkeypatch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
+    with pytest.raises(EquilibriumError, match=r"no equilibrium in quadratic elements: use linear ones"):
+        refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
 
 
 def test_the_fit_comes_nearer_than_the_relaxed_positions(fitted: tuple[str, Artifacts]) -> None:
