@@ -30,8 +30,8 @@ MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # and by, the surest first, if they are at most this share: that takes fewer steps than to raise the price of all of
 # them until the last is 0 or 1, and leaves a smaller error.
 HARD_STEPS, FEW_LEFT = 2, 0.1
-# Up to this share of undecided tets is rounded at once where the steps come to nothing; with more left, the design that
-# other elements have rounded is the better one.
+# Up to this share of undecided tets is rounded where the steps come to nothing; with more left, the design that other
+# elements have rounded is the better one.
 LAST_SHARE = 0.05
 # The design is near already: a few steps relax it, and it is rounded in half the steps of a search from the start.
 RELAX_ITERATIONS, ROUND_GROWTH = 3, 2.5
@@ -69,10 +69,13 @@ def carried_in(problem: Problem, relaxed: Search) -> Search | None:
     return None if start is None else replace(relaxed, equilibria=equilibria, design=start)
 
 
-def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
+def rounded_from(
+    carried: Search, settings: ReducedSettings, watch: Watch, last_share: float = LAST_SHARE
+) -> Search | None:
     """A near 0/1 design from a relaxed one that was carried over from another discretisation.
 
     watch : is shown the phase and the state after each step
+    last_share : up to which undecided tets are rounded where the steps come to nothing
     None where no equilibria lead to 0 and 1.
     """
     problem = carried.equilibria.problem
@@ -86,7 +89,7 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        if settings.decide_in_steps and not tried and hard >= HARD_STEPS and left <= FEW_LEFT:
+        if not tried and hard >= HARD_STEPS and left <= FEW_LEFT:
             design, tried = decided_by_and_by(at, settings), True
             if design is not None:
                 at = replace(at, design=design, phase=Phase.DONE)
@@ -94,7 +97,7 @@ def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch) -> Se
                 return at
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, LAST_SHARE)
+    return decided(at, settings, last_share)
 
 
 def _is_hard(after: Search) -> bool:

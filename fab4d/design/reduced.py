@@ -64,7 +64,6 @@ class ReducedSettings:
     factor by which lam_round grows in each step.
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
-    decide_in_steps : whether what rounding leaves undecided is rounded by and by, the rest following
     centers : (n_points,) vertices at which points are held first; None spreads them over the body
     """
 
@@ -77,7 +76,6 @@ class ReducedSettings:
     undecided_fraction: float = 2e-4
     round_growth: float = 1.6
     nearly: float = 1.5
-    decide_in_steps: bool = True
     centers: IntArray | None = None
 
 
@@ -363,8 +361,7 @@ def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search 
     if left > most:
         return None
     try:
-        design = decided_by_and_by(at, settings) if settings.decide_in_steps else None
-        design = design or change_density(at.equilibria, at.design, np.round(at.design.rho))
+        design = decided_by_and_by(at, settings) or change_density(at.equilibria, at.design, np.round(at.design.rho))
     except EquilibriumError:
         return None
     return replace(at, design=design, phase=Phase.DONE)
@@ -373,7 +370,7 @@ def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search 
 def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
     """The surest densities rounded first; the others and the held positions make up for it.
 
-    None where there is no equilibrium on the way.
+    None where there is no equilibrium on the way. Densities that are nearly 0 or 1 stay so where they cannot all be.
     """
     equilibria, design, damping = at.equilibria, at.design, at.damping
     weights, L = _rounding_weights(at, settings).replace(lam_round=0.0), smoothness_matrix(equilibria.problem)
@@ -386,9 +383,12 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
             design = change_density(equilibria, design, rho)
             step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
             design, damping = step.design, min(step.damping, LARGEST_DAMPING)
-        return change_density(equilibria, design, np.round(design.rho))
     except EquilibriumError:
         return None
+    try:
+        return change_density(equilibria, design, np.round(design.rho))
+    except EquilibriumError:
+        return design
 
 
 # -- refit

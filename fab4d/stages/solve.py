@@ -503,7 +503,7 @@ def search_settings(
         weights=weights.replace(lam_smooth=smooth * weights.lam_smooth, lam_SMP=smp * weights.lam_SMP),
         max_smp_fraction=USUAL_SMP_FRACTION if limit is None else WITHIN_LIMIT * limit,
     )
-    fast = replace(settings, round_growth=FAST_GROWTH, nearly=1.0, decide_in_steps=False)
+    fast = replace(settings, round_growth=FAST_GROWTH, nearly=1.0)
     return fast if problem.n_tets > MANY_TETS else settings
 
 

@@ -132,9 +132,9 @@ def test_rounding_goes_on_where_the_last_few_tets_cannot_be_decided(
     assert set(np.unique(np.round(at.design.rho, 2))) == {0.0, 1.0}
 
 
-@pytest.mark.parametrize(("decide_in_steps", "hard"), [(False, [True]), (True, [False]), (True, [True, False])])
-def test_tets_are_not_decided_by_and_by_where_steps_lead_on_or_the_mesh_is_large(
-    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, decide_in_steps: bool, hard: list[bool]
+@pytest.mark.parametrize("hard", [[False], [True, False]])
+def test_tets_are_not_decided_by_and_by_where_steps_lead_on(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, hard: list[bool]
 ) -> None:
     """Single hard steps are none in a row."""
     steps = itertools.cycle(hard)
@@ -143,8 +143,24 @@ def test_tets_are_not_decided_by_and_by_where_steps_lead_on_or_the_mesh_is_large
     monkeypatch.setattr(finish, "decided_by_and_by", lambda *_: pytest.fail("decided"))
     carried = carried_in(quadratic, found)
     assert carried is not None
-    settings = replace(settings_for(quadratic), decide_in_steps=decide_in_steps)
-    assert rounded_from(carried, settings, lambda *_: None) is not None
+    assert rounded_from(carried, settings_for(quadratic), lambda *_: None) is not None
+
+
+def test_what_steps_leave_undecided_is_rounded_where_no_other_design_is(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first step of the rounding, which leaves more than is rounded by default."""
+    for name, value in (("_is_hard", lambda _: True), ("MOST_HELD_BACK", 1), ("LITTLE_DECIDED", 0.0)):
+        monkeypatch.setattr(finish, name, value)
+    carried, settings = carried_in(quadratic, found), settings_for(quadratic)
+    assert carried is not None
+    shown: list[Search] = []
+    assert rounded_from(carried, settings, lambda _, at: shown.append(at)) is None
+    assert undecided_fraction(shown[-1].design.rho) > LAST_SHARE
+    at = rounded_from(carried, settings, lambda *_: None, 1.0)
+    assert at is not None
+    assert undecided_fraction(at.design.rho) <= settings.undecided_fraction
+    assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
 
 
 @pytest.mark.parametrize(("share_left", "ends"), [(0.95, True), (0.8, False)])

@@ -305,7 +305,8 @@ def test_rounding_ends_where_no_step_is_taken(
         return gauss_newton.Step(design, np.inf, damping, False)
 
     monkeypatch.setattr(reduced, "gauss_newton_step", refuse)
-    found = solve_reduced(truth.problem, settings_for(truth.problem, decide_in_steps=False), lambda at: None, before)  # noqa: ARG005
+    monkeypatch.setattr(reduced, "decided_by_and_by", lambda *_: None)
+    found = solve_reduced(truth.problem, settings_for(truth.problem), lambda at: None, before)  # noqa: ARG005
     assert len(refused) == 3
     assert found.phase is Phase.DONE
     np.testing.assert_array_equal(found.design.rho, np.round(before.design.rho))
@@ -343,19 +344,22 @@ def test_rounding_spends_little_more_than_the_relaxed_error_but_asks_for_no_tiny
     assert weights.error_scale == pytest.approx(scale * tolerance)
 
 
-def test_densities_left_undecided_are_rounded_at_once(truth: Truth, searched: list[Search]) -> None:
-    """Where the steps have come to nothing; but only up to a share, if one is given."""
+def test_densities_left_undecided_are_rounded_at_once(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the steps have come to nothing and they cannot be decided by and by; but only up to a share, if given."""
     last, problem = searched[-1], truth.problem
     rho = np.round(last.design.rho)
     rho[:12] = np.abs(rho[:12] - 0.3)
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
-    at_once = settings_for(problem, decide_in_steps=False)
-    found = solve_reduced(problem, at_once, lambda at: None, ended)  # noqa: ARG005
+    settings = settings_for(problem)
+    assert decided(ended, settings, 12 / 120) is not None
+    monkeypatch.setattr(reduced, "decided_by_and_by", lambda *_: None)
+    found = solve_reduced(problem, settings, lambda at: None, ended)  # noqa: ARG005
     np.testing.assert_array_equal(found.design.rho, np.round(rho))
     assert balance(found.equilibria, found.design.rho, found.design.median, found.design.final).final < 1e-5
-    for settings in (at_once, settings_for(problem)):
-        assert decided(ended, settings, 12 / 120) is not None
-        assert decided(ended, settings, 11 / 120) is None
+    assert decided(ended, settings, 12 / 120) is not None
+    assert decided(ended, settings, 11 / 120) is None
 
 
 def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list[Search]) -> None:
@@ -364,33 +368,53 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     rho = np.round(last.design.rho)
     rho[::5] = np.abs(rho[::5] - np.linspace(0.4, 0.49, len(rho[::5])))
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
-    at_once, by_and_by = (decided(ended, settings_for(problem, decide_in_steps=steps), 1.0) for steps in (False, True))
-    assert at_once is not None
+    at_once, by_and_by = (
+        change_density(last.equilibria, ended.design, np.round(rho)),
+        decided(ended, settings_for(problem)),
+    )
     assert by_and_by is not None
     assert set(np.unique(by_and_by.design.rho)) == {0.0, 1.0}
     assert (
         balance(by_and_by.equilibria, by_and_by.design.rho, by_and_by.design.median, by_and_by.design.final).final
         < 1e-5
     )
-    assert rms(problem, by_and_by.design) < rms(problem, at_once.design)
+    assert rms(problem, by_and_by.design) < rms(problem, at_once)
+
+
+def lost_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes this call of change_density find no equilibrium, and every step leave the design as it is."""
+    calls = itertools.count(1)
+
+    def follow(_: Equilibria, design: Design, rho: np.ndarray) -> Design:
+        if next(calls) == call:
+            raise EquilibriumError
+        return replace(design, rho=rho)
+
+    monkeypatch.setattr(reduced, "change_density", follow)
+    monkeypatch.setattr(reduced, "gauss_newton_step", lambda *given, **_: gauss_newton.Step(given[3], 0.0, 1.0, True))
 
 
 @pytest.mark.parametrize("lost", [1, 2])
 def test_without_an_equilibrium_nothing_is_decided_by_and_by(
     truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, lost: int
 ) -> None:
-    last, calls = searched[-1], itertools.count(1)
+    last = searched[-1]
     undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)))
-
-    def follow(_: Equilibria, design: Design, rho: np.ndarray) -> Design:
-        if next(calls) == lost:
-            raise EquilibriumError
-        return replace(design, rho=rho)
-
-    monkeypatch.setattr(reduced, "change_density", follow)
-    monkeypatch.setattr(reduced, "gauss_newton_step", lambda *given, **_: gauss_newton.Step(given[3], 0.0, 1.0, True))
+    lost_at(lost, monkeypatch)
     assert decided_by_and_by(undecided, settings_for(truth.problem)) is None
-    assert next(calls) == lost + 1
+
+
+def test_what_is_nearly_decided_stays_so_where_it_cannot_all_be(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two tets are undecided, so that one half is decided at once, and then all that is nearly 0 or 1."""
+    last = searched[-1]
+    rho = np.abs(np.round(last.design.rho) - 1e-3)
+    rho[:2] = 0.3
+    lost_at(2, monkeypatch)
+    design = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    assert design is not None
+    np.testing.assert_array_equal(design.rho, np.r_[0.0, 0.0, rho[2:]])
 
 
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:

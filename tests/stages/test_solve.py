@@ -125,10 +125,7 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
     assert usual.nearly > fast.nearly == 1.0
-    assert usual.decide_in_steps > fast.decide_in_steps
-    assert vars(replace(fast, round_growth=usual.round_growth, nearly=usual.nearly, decide_in_steps=True)) == vars(
-        usual
-    )
+    assert vars(replace(fast, round_growth=usual.round_growth, nearly=usual.nearly)) == vars(usual)
 
 
 def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
@@ -324,9 +321,9 @@ def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
     monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
     rounded_from, n_tets, before = _bring_up.rounded_from, len(fine_bar["tets"]), list[float]()
 
-    def rounded_off(carried: Search, settings: Any, watch: Any) -> Search | None:
+    def rounded_off(carried: Search, *given: Any) -> Search | None:
         if len(carried.design.rho) < n_tets:
-            return rounded_from(carried, settings, watch)
+            return rounded_from(carried, *given)
         problem, final = carried.equilibria.problem, carried.design.final
         before.append(shape_error(problem, final.y).rms * problem.length)
         if nearer is None:
@@ -364,7 +361,7 @@ def test_a_coarse_mesh_is_searched_for_less_than_the_tolerance(
 def test_a_design_that_needs_too_much_smp_when_rounded_again_is_not_taken(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def all_smp(carried: Search, settings: Any, watch: Any) -> Search:  # noqa: ARG001
+    def all_smp(carried: Search, *_: Any) -> Search:
         return replace(carried, design=replace(carried.design, rho=np.ones(len(carried.design.rho))))
 
     monkeypatch.setattr(_bring_up, "rounded_from", all_smp)
