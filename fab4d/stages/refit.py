@@ -42,8 +42,9 @@ ALLOWED_LOSS = 1.15
 # So they do where the relaxed design is out of reach of the tolerance, and in quadratic elements that are too many to
 # round in: there the first is the tolerance itself.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
-# At this share of the tolerance flips end with the first round that gains little.
-LOW_ERROR = 0.15
+# At this share of the tolerance flips end with the first round that gains little; with more than MANY_DOFS unknowns,
+# where each round takes about a minute, at the tolerance.
+LOW_ERROR, MANY_DOFS = 0.15, 40_000
 # Some rounds of flips bring a design from up to this multiple of the error at which they end there.
 WITHIN_REACH = 1.25
 # Printed labels are compared after so many steps of the held positions: before them the error tells little.
@@ -68,7 +69,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
-    settings = _flip_settings(inputs, profile, problem, weights)
+    settings = _flip_settings(inputs, profile, rounding, weights)
     first = _printed_design(equilibria, relaxed, rounded["smp"], weights, settings)
     design = first.fitted
     trace.add("printed", Search(equilibria, first.design))
@@ -301,7 +302,8 @@ def _flip_settings(
     relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
     down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
     settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
-    settings = replace(settings, tolerance=weights.error_scale, low_rms=LOW_ERROR * weights.error_scale)
+    low = LOW_ERROR if 3 * problem.n_nodes <= MANY_DOFS else 1.0
+    settings = replace(settings, tolerance=weights.error_scale, low_rms=low * weights.error_scale)
     few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * weights.error_scale
     return replace(settings, rounds=FEW_ROUNDS) if few else settings
 
