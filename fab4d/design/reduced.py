@@ -49,6 +49,8 @@ DEARER = 0.86
 MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, with as many tries of a step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, DECIDED_TRIES = 0.5, 4, 3
+# Densities that are nearly 0 or 1 are rounded in steps of at least this share of the way.
+LAST_STEP = 0.1
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -386,7 +388,7 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
     except EquilibriumError:
         return None
     try:
-        return change_density(equilibria, design, np.round(design.rho))
+        return change_density(equilibria, design, np.round(design.rho), LAST_STEP)
     except EquilibriumError:
         return design
 

@@ -385,7 +385,7 @@ def lost_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes this call of change_density find no equilibrium, and every step leave the design as it is."""
     calls = itertools.count(1)
 
-    def follow(_: Equilibria, design: Design, rho: np.ndarray) -> Design:
+    def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float) -> Design:
         if next(calls) == call:
             raise EquilibriumError
         return replace(design, rho=rho)
