@@ -35,7 +35,7 @@ def coarse_for(
 ) -> list[Coarse]:
     """Coarse meshes of linear elements, each of the one before it; empty where the search is on the mesh itself.
 
-    The search is on the last one, and its relaxed design is rounded on the one before. element : of the last fit
+    The search is on the last one, and its relaxed design is rounded on the one before. element : of the rounding
     """
     if element != "linear" or problem.n_tets <= MANY_TETS:
         return []

@@ -62,9 +62,9 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
     mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
     elements = elements_for(mesh, profile["solver"].element)
-    rounding, problem = (
-        problem_of(mesh, profile["materials"], element) for element in (elements.rounding, elements.last_fit)
-    )
+    rounding = problem = problem_of(mesh, profile["materials"], elements.rounding)
+    if elements.last_fit != elements.rounding:
+        problem = problem_of(mesh, profile["materials"], elements.last_fit)
     equilibria = Equilibria(rounding, patches_of(rounding, relaxed))
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
@@ -77,7 +77,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     fit = _Fit(equilibria, design)
     if equilibria.patches.count:
         radius, polish = float(relaxed["patch_radius"]) / problem.length, _polish(weights, settings, trace)
-        if elements.last_fit != elements.rounding:
+        if problem is not rounding:
             design = polish(equilibria, refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
             carried = _in_elements_of(problem, Search(equilibria, design))
             trace.add("carried over", carried)

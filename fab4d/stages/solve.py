@@ -102,7 +102,11 @@ def _designed(
     more_beginnings: int = 1,
 ) -> tuple[Search, Search, dict[str, Any]]:
     """The design of all attempts, with the least SMP if the goal asks for that, it before rounding, and what the report
-    says of it."""
+    says of it.
+
+    element : in which designs are rounded and judged as printed: that of the last fit, here and below, unless its
+        unknowns are too many for that
+    """
     searched = _search(problem, mesh, profile, element, trace, monitor, more_beginnings)
     least = None
     if profile["goal"].smp == "least":
