@@ -49,8 +49,10 @@ DEARER = 0.86
 MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, with as many tries of a step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, DECIDED_TRIES = 0.5, 4, 3
-# Densities that are nearly 0 or 1 are rounded in steps of at least this share of the way.
+# Densities are rounded in steps of at least this share of the way.
 LAST_STEP = 0.1
+# Where no equilibrium leads to more of them, this share of tets may stay undecided: printing rounds them.
+LEFT_UNDECIDED = 0.02
 # Held at fewer points, a part without a clamp can turn about the line through them.
 FEWEST_FREE_POINTS = 3
 # A fit of the held positions ends with a step that gains less than the first share of the objective, and tries no step
@@ -372,7 +374,8 @@ def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search 
 def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
     """The surest densities rounded first; the others and the held positions make up for it.
 
-    None where there is no equilibrium on the way. Densities that are nearly 0 or 1 stay so where they cannot all be.
+    Where no equilibrium leads on, the last few stay undecided; None where they are more than LEFT_UNDECIDED. Densities
+    that are nearly 0 or 1 stay so where they cannot all be.
     """
     equilibria, design, damping = at.equilibria, at.design, at.damping
     weights, L = _rounding_weights(at, settings).replace(lam_round=0.0), smoothness_matrix(equilibria.problem)
@@ -382,11 +385,12 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
             sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
             rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
             rho[sure], movable[unsure] = np.round(rho[sure]), True
-            design = change_density(equilibria, design, rho)
+            design = change_density(equilibria, design, rho, LAST_STEP)
             step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
             design, damping = step.design, min(step.damping, LARGEST_DAMPING)
     except EquilibriumError:
-        return None
+        if undecided_fraction(design.rho) > LEFT_UNDECIDED:
+            return None
     try:
         return change_density(equilibria, design, np.round(design.rho), LAST_STEP)
     except EquilibriumError:

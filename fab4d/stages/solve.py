@@ -54,9 +54,9 @@ NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed d
 # Where MANY_TETS are searched, for no coarser mesh does, they are rounded in about half the steps, none of which leads
 # past unstable states: that takes many times longer.
 FAST_GROWTH = 2.5
-# A coarse mesh is searched from so many times more random points where the usual ones nearly do: what is found there
+# A coarse mesh is searched from so many times more other points where the usual ones nearly do: what is found there
 # saves steps on all tets, which take minutes.
-MORE_BEGINNINGS = 3
+MORE_BEGINNINGS = 6
 # Where the tolerance is far out of reach, what so many times the points would leave of the error tells whether points
 # are what is missing.
 MANY_MORE = 4

@@ -381,12 +381,12 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     assert rms(problem, by_and_by.design) < rms(problem, at_once)
 
 
-def lost_at(call: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes this call of change_density find no equilibrium, and every step leave the design as it is."""
+def lost_at(call: int, monkeypatch: pytest.MonkeyPatch, last: int | None = None) -> None:
+    """Makes this call of change_density, or all to the last, find no equilibrium; steps leave the design as it is."""
     calls = itertools.count(1)
 
     def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float) -> Design:
-        if next(calls) == call:
+        if call <= next(calls) <= (call if last is None else last):
             raise EquilibriumError
         return replace(design, rho=rho)
 
@@ -402,6 +402,22 @@ def test_without_an_equilibrium_nothing_is_decided_by_and_by(
     undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)))
     lost_at(lost, monkeypatch)
     assert decided_by_and_by(undecided, settings_for(truth.problem)) is None
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.05, True), (0.0, False)])
+def test_the_last_few_stay_undecided_where_no_equilibrium_leads_on(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, share: float, kept: bool
+) -> None:
+    """Twelve tets are undecided; half of them are decided, then the rest finds no equilibrium, nor do all at once."""
+    last = searched[-1]
+    rho = np.round(last.design.rho)
+    rho[:12] = np.abs(rho[:12] - np.linspace(0.3, 0.4, 12))
+    lost_at(2, monkeypatch, last=9)
+    monkeypatch.setattr(reduced, "LEFT_UNDECIDED", share)
+    design = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    assert (design is not None) is kept
+    if design is not None:
+        assert undecided_fraction(design.rho) == 6 / truth.problem.n_tets
 
 
 def test_what_is_nearly_decided_stays_so_where_it_cannot_all_be(

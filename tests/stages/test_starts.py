@@ -14,7 +14,7 @@ from fab4d.design import starts as starts_of_design
 from fab4d.design.patches import build_patches, pad_vertices
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import ReducedSettings, Search, relaxed
-from fab4d.design.starts import random_centers
+from fab4d.design.starts import beginnings, crossed_centers, random_centers
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal
 from fab4d.stages import _starts
@@ -73,6 +73,39 @@ def test_random_points_are_apart_from_each_other_and_from_the_clamp() -> None:
         assert set(centers.tolist()) <= among
     assert len({tuple(centers) for centers in several}) > 3
     np.testing.assert_array_equal(several[0], random_centers(PROBLEM, 4, 0))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_crossed_points_are_some_of_both(seed: int) -> None:
+    one, other = random_centers(PROBLEM, 4, 0), random_centers(PROBLEM, 4, 1)
+    found = crossed_centers(PROBLEM, one, other, np.random.default_rng(seed))
+    assert len(set(found.tolist())) == 4
+    assert set(found.tolist()) <= {*one.tolist(), *other.tolist()}
+    np.testing.assert_array_equal(
+        np.sort(crossed_centers(PROBLEM, one, one, np.random.default_rng(seed))), np.sort(one)
+    )
+
+
+def test_the_second_half_of_the_beginnings_is_crossed_from_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, errors, begun = usual(0.3), iter([5.0, 1.0, 9.0, 1.1, 3.0, 3.0, 3.0, 3.0]), list[np.ndarray]()
+
+    def ended(problem: Problem, settings: ReducedSettings, watch: Any) -> Search:  # noqa: ARG001
+        if len(begun) == 2:
+            begun.append(np.zeros(0, np.int64))
+            raise EquilibriumError
+        begun.append(settings.centers)
+        patches = build_patches(problem, settings.centers, 0.03)
+        return replace(first, equilibria=first.equilibria.with_patches(patches), relaxed_rms=next(errors))
+
+    monkeypatch.setattr(starts_of_design, "relaxed", ended)
+    monkeypatch.setattr(starts_of_design, "PARENTS", 2)
+    found = list(beginnings(PROBLEM, settings_of(0.3, 4)(PROBLEM), lambda at: None, 8))  # noqa: ARG005
+    assert len(found) == 7
+    for seed in (0, 1, 3):
+        np.testing.assert_array_equal(begun[seed], random_centers(PROBLEM, 4, seed))
+    # The errors are 5, 1 and, past the one that is lost, 9: the best two are the second and the first.
+    best = {*begun[1].tolist(), *begun[0].tolist()}
+    assert set(begun[4].tolist()) <= best
 
 
 @pytest.mark.parametrize(("share", "looked_for"), [(0.6, False), (0.8, True), (1.1, False)])
