@@ -1,12 +1,12 @@
 """A relaxed design carried over to other elements of the same mesh, and rounded there."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
-from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
+from fab4d.design.gauss_newton import FIRST_DAMPING, SEARCH_TOLERANCE, Design, equilibrate
 from fab4d.design.objective import smoothness_matrix
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem, at_nodes
@@ -30,11 +30,29 @@ MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # and by, the surest first, if they are at most this share: that takes fewer steps than to raise the price of all of
 # them until the last is 0 or 1, and leaves a smaller error.
 HARD_STEPS, FEW_LEFT = 2, 0.1
-# Up to this share of undecided tets is rounded where the steps come to nothing; with more left, the design that other
-# elements have rounded is the better one.
-LAST_SHARE = 0.05
-# The design is near already: a few steps relax it, and it is rounded in half the steps of a search from the start.
-RELAX_ITERATIONS, ROUND_GROWTH = 3, 2.5
+# It is rounded in half the steps of a search from the start.
+ROUND_GROWTH = 2.5
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How a design that was carried over is relaxed further and rounded.
+
+    relax_iterations : steps of relaxing at most
+    last_share : up to this share of undecided tets is rounded where the steps come to nothing
+    astray : whether steps past unstable states are taken, once those that stay are hard
+    """
+
+    relax_iterations: int
+    last_share: float
+    astray: bool
+
+
+# The design is near already. With more tets left, the design that the elements before have rounded is the better one.
+OTHER_ELEMENTS = Rounding(relax_iterations=3, last_share=0.05, astray=False)
+# Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there,
+# and the labels of the coarser mesh err by far more.
+FINER_MESH = Rounding(relax_iterations=6, last_share=0.5, astray=True)
 
 Watch = Callable[[str, Search], None]
 
@@ -70,22 +88,24 @@ def carried_in(problem: Problem, relaxed: Search) -> Search | None:
 
 
 def rounded_from(
-    carried: Search, settings: ReducedSettings, watch: Watch, last_share: float = LAST_SHARE
+    carried: Search, settings: ReducedSettings, watch: Watch, how: Rounding = OTHER_ELEMENTS
 ) -> Search | None:
     """A near 0/1 design from a relaxed one that was carried over from another discretisation.
 
     watch : is shown the phase and the state after each step
-    last_share : up to which undecided tets are rounded where the steps come to nothing
     None where no equilibria lead to 0 and 1.
     """
     problem = carried.equilibria.problem
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    settings = replace(settings, relax_iterations=RELAX_ITERATIONS, round_growth=ROUND_GROWTH)
+    settings = replace(settings, relax_iterations=how.relax_iterations, round_growth=ROUND_GROWTH)
     L, hard, held_back, tried = smoothness_matrix(problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
+        if how.astray and before.stay and _is_hard(at):
+            at = replace(at if at.accepted else before, stay=False, damping=FIRST_DAMPING)
+            continue
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
@@ -97,7 +117,7 @@ def rounded_from(
                 return at
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, last_share)
+    return decided(at, settings, how.last_share)
 
 
 def _is_hard(after: Search) -> bool:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from fab4d.design.finish import rounded_from
+from fab4d.design.finish import FINER_MESH, rounded_from
 from fab4d.design.levels import Level, carried_up
 from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
@@ -14,9 +14,6 @@ from fab4d.io.scene import Goal
 COARSE_SHARE = 0.8
 # Relaxed designs beyond this multiple of the tolerance are not rounded where that takes long.
 OUT_OF_REACH = 1.25
-# Up to this share of undecided tets is rounded on the finer mesh where the steps come to nothing, for squeezed surfaces
-# turn unstable in waves that the coarse one does not show: its own labels err by far more there.
-MOST_UNDECIDED = 0.5
 # A design that was carried over may miss the tolerance by this much: the fit of its held positions wins back as much.
 WON_BY_FIT = 1.05
 
@@ -77,7 +74,7 @@ def _farther_up(level: Level, at: Search, settings: ReducedSettings, goal: Goal,
     carried, tolerance = carried_up(level, at), settings.weights.error_scale
     if carried is None or _rms(carried) <= WON_BY_FIT * tolerance or _rms(at) > OUT_OF_REACH * tolerance:
         return _shown(carried, add)
-    rounded = rounded_from(carried, replace(settings, nearly=1.0), add, MOST_UNDECIDED)
+    rounded = rounded_from(carried, replace(settings, nearly=1.0), add, FINER_MESH)
     if rounded is not None and affordable(rounded, goal) and _rms(rounded) < _rms(carried):
         return rounded
     return _shown(carried, add)
@@ -96,7 +93,7 @@ def _shown(carried: Search | None, add: Add) -> Search | None:
 def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
     """None where it finds no equilibrium on the way, or needs more SMP than the goal allows."""
     start = carried_up(level, relaxed)
-    rounded = None if start is None else rounded_from(start, replace(settings, nearly=1.0), add, MOST_UNDECIDED)
+    rounded = None if start is None else rounded_from(start, replace(settings, nearly=1.0), add, FINER_MESH)
     return rounded if affordable(rounded, goal) else None
 
 

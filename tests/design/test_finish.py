@@ -9,7 +9,16 @@ from bars import bar
 
 from fab4d.design import finish
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.finish import FEW_LEFT, LAST_SHARE, MOST_HELD_BACK, carried_in, carried_over, rounded_from
+from fab4d.design.finish import (
+    FEW_LEFT,
+    FINER_MESH,
+    MOST_HELD_BACK,
+    OTHER_ELEMENTS,
+    Rounding,
+    carried_in,
+    carried_over,
+    rounded_from,
+)
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
@@ -87,7 +96,7 @@ def test_a_design_is_rounded_in_the_other_elements(found: Search, quadratic: Pro
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
     assert [phase for phase, _ in shown][:2] == ["carried over", "relax"]
     shares = [undecided_fraction(state.design.rho) for _, state in shown]
-    assert shares[0] > 10 * LAST_SHARE
+    assert shares[0] > 10 * OTHER_ELEMENTS.last_share
 
 
 def test_without_an_equilibrium_nothing_is_rounded(found: Search) -> None:
@@ -156,8 +165,8 @@ def test_what_steps_leave_undecided_is_rounded_where_no_other_design_is(
     assert carried is not None
     shown: list[Search] = []
     assert rounded_from(carried, settings, lambda _, at: shown.append(at)) is None
-    assert undecided_fraction(shown[-1].design.rho) > LAST_SHARE
-    at = rounded_from(carried, settings, lambda *_: None, 1.0)
+    assert undecided_fraction(shown[-1].design.rho) > OTHER_ELEMENTS.last_share
+    at = rounded_from(carried, settings, lambda *_: None, replace(OTHER_ELEMENTS, last_share=1.0))
     assert at is not None
     assert undecided_fraction(at.design.rho) <= settings.undecided_fraction
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
@@ -186,3 +195,37 @@ def test_hard_steps_that_decide_little_end_the_rounding(
     )
     rounded_from(carried, settings_for(quadratic), lambda *_: None)
     assert (len(made) == MOST_HELD_BACK) == ends
+
+
+@pytest.mark.parametrize(
+    ("how", "accepted", "made"),
+    [
+        (OTHER_ELEMENTS, False, [(Phase.RELAX, True), (Phase.ROUND, True)]),
+        (OTHER_ELEMENTS, True, [(Phase.RELAX, True), (Phase.ROUND, True)]),
+        (FINER_MESH, False, [(Phase.RELAX, True), (Phase.RELAX, False), (Phase.ROUND, False)]),
+        (FINER_MESH, True, [(Phase.RELAX, True), (Phase.ROUND, False)]),
+    ],
+)
+def test_on_finer_meshes_steps_go_astray_once_those_that_stay_are_hard(
+    found: Search,
+    quadratic: Problem,
+    monkeypatch: pytest.MonkeyPatch,
+    how: Rounding,
+    accepted: bool,
+    made: list[tuple[Phase, bool]],
+) -> None:
+    """A step that failed is made again; one that was taken with much damping counts."""
+    steps, dampings = [], []
+
+    def step(at: Search, *_: object) -> Search:
+        steps.append((at.phase, at.stay))
+        dampings.append(at.damping)
+        phase = Phase.ROUND if at.phase is Phase.RELAX else Phase.DONE
+        return replace(at, phase=phase, accepted=accepted, damping=100 * LARGEST_DAMPING)
+
+    monkeypatch.setattr(finish, "STEPS", {Phase.RELAX: step, Phase.ROUND: step})
+    carried = carried_in(quadratic, found)
+    assert carried is not None
+    rounded_from(carried, settings_for(quadratic), lambda *_: None, how)
+    assert steps == made
+    assert [stay for _, stay in made].count(False) == 0 or dampings[1] == dampings[0]

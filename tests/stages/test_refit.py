@@ -24,7 +24,7 @@ from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
-from fab4d.stages import _element, refit, solve, threshold
+from fab4d.stages import _design, _element, refit, solve, threshold
 from fab4d.stages._design import objective_weights, patches_of, problem_of
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
@@ -204,7 +204,8 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
 def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     """Of labels that were spoilt: what is printed comes nearer than they do, or is they where flips mislead."""
     equilibria, weights, settings = fit_of(inputs)
-    problem = equilibria.problem
+    # Spoilt labels squeeze so coarse a bar: fits would keep from that more than they lower the error.
+    problem, weights = equilibria.problem, weights.replace(lam_squeeze=0.0)
     spoilt = inputs["rounded"]["smp"].copy()
     spoilt[np.flatnonzero(at_interface(problem, spoilt))[::12]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
@@ -381,6 +382,8 @@ def test_a_fit_that_loading_does_not_lead_to_is_told_where_it_alone_meets_the_to
         return replace(done, final=replace(done.final, y=done.final.y + away))
 
     monkeypatch.setattr(refit, "polish_labels", lambda equilibria, design, *_: design)  # noqa: ARG005
+    # What the error yields to squeezed tets depends on the tolerance.
+    monkeypatch.setattr(_design, "LAM_SQUEEZE", 0.0)
     usual = refit.run(inputs, PROFILE, SilentMonitor())
     problem = equilibria_of(inputs, usual).problem
     fit_mm = shape_error(problem, usual["printed"]["y"] / problem.length).rms * problem.length
