@@ -1,7 +1,7 @@
 """A design that was searched on a coarser mesh, brought to all tets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from fab4d.design.finish import FINER_MESH, rounded_from
 from fab4d.design.levels import Level, carried_up
@@ -35,12 +35,22 @@ def brought_up(
     The equilibria of a finer mesh are others: the design is relaxed further and rounded again on the first one, and on
     those after it, where a step takes minutes, if it misses the tolerance there by more than the later fit wins back.
     """
-    first, *others = levels
-    relaxed = before if before.phase is Phase.ROUND else None
-    at = _one_up(first, relaxed, found, settings_of(first.fine), goal, traces[0])
-    for level, add in zip(others, traces[1:], strict=True):
-        at = None if at is None else _farther_up(level, at, settings_of(level.fine), goal, add)
-    return at
+    at = _Design(before if before.phase is Phase.ROUND else None, found)
+    for level, add in zip(levels, traces, strict=True):
+        up = _one_up if level is levels[0] else _farther_up
+        reached = up(level, at, settings_of(level.fine), goal, add)
+        if reached is None:
+            return None
+        at = reached
+    return at.found
+
+
+@dataclass(frozen=True, eq=False)
+class _Design:
+    """The near 0/1 design of a mesh, and the relaxed one that it was rounded from; None where it is not."""
+
+    relaxed: Search | None
+    found: Search
 
 
 def affordable(finished: Search | None, goal: Goal) -> bool:
@@ -55,46 +65,51 @@ def far_off(relaxed: Search, settings: ReducedSettings) -> bool:
     return relaxed.relaxed_rms > OUT_OF_REACH * settings.weights.error_scale
 
 
-def _one_up(
-    level: Level, relaxed: Search | None, found: Search, settings: ReducedSettings, goal: Goal, add: Add
-) -> Search | None:
+def _one_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
     """The design on the finer mesh, rounded there where it is not far off; else as it is carried over."""
-    tolerance = settings.weights.error_scale
     rounded = None
-    if relaxed is not None and not far_off(relaxed, settings):
-        rounded = _rounded(level, relaxed, settings, goal, add)
-    if rounded is not None and _rms(rounded) <= tolerance:
+    if at.relaxed is not None and not far_off(at.relaxed, settings):
+        rounded = _rounded(level, at.relaxed, settings, goal, add)
+    if rounded is not None and _rms(rounded.found) <= settings.weights.error_scale:
         return rounded
-    reached = [each for each in (rounded, _carried(level, found, add)) if each is not None]
-    return min(reached, key=_rms, default=None)
+    return _better(rounded, _carried(level, at.found, add))
 
 
-def _farther_up(level: Level, at: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
-    """The near 0/1 design on a mesh that is finer still."""
-    carried, tolerance = carried_up(level, at), settings.weights.error_scale
-    if carried is None or _rms(carried) <= WON_BY_FIT * tolerance or _rms(at) > OUT_OF_REACH * tolerance:
-        return _shown(carried, add)
-    rounded = rounded_from(carried, replace(settings, nearly=1.0), add, FINER_MESH)
-    if rounded is not None and affordable(rounded, goal) and _rms(rounded) < _rms(carried):
-        return rounded
-    return _shown(carried, add)
+def _farther_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
+    """The design on a mesh that is finer still, as it is carried over, or rounded there where that is worth it."""
+    carried, tolerance = _carried(level, at.found, add), settings.weights.error_scale
+    near = carried is None or _rms(carried.found) <= WON_BY_FIT * tolerance
+    if near or _rms(at.found) > OUT_OF_REACH * tolerance:
+        return carried
+    return _better(_rounded(level, at.relaxed or at.found, settings, goal, add), carried)
 
 
-def _carried(level: Level, at: Search, add: Add) -> Search | None:
-    return _shown(carried_up(level, at), add)
+def _carried(level: Level, at: Search, add: Add) -> _Design | None:
+    carried = carried_up(level, at)
+    if carried is None:
+        return None
+    add("carried over", carried)
+    return _Design(None, carried)
 
 
-def _shown(carried: Search | None, add: Add) -> Search | None:
-    if carried is not None:
-        add("carried over", carried)
-    return carried
-
-
-def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goal, add: Add) -> Search | None:
+def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
     """None where it finds no equilibrium on the way, or needs more SMP than the goal allows."""
-    start = carried_up(level, relaxed)
-    rounded = None if start is None else rounded_from(start, replace(settings, nearly=1.0), add, FINER_MESH)
-    return rounded if affordable(rounded, goal) else None
+    start = further = carried_up(level, relaxed)
+    if start is None:
+        return None
+
+    def watch(phase: str, at: Search) -> None:
+        nonlocal further
+        if at.phase is Phase.ROUND and not at.iteration:
+            further = at
+        add(phase, at)
+
+    rounded = rounded_from(start, replace(settings, nearly=1.0), watch, FINER_MESH)
+    return None if rounded is None or not affordable(rounded, goal) else _Design(further, rounded)
+
+
+def _better(one: _Design | None, other: _Design | None) -> _Design | None:
+    return min((each for each in (one, other) if each is not None), key=lambda each: _rms(each.found), default=None)
 
 
 def _rms(at: Search) -> float:

@@ -11,7 +11,7 @@ from shapes.boxes import box
 
 from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Search, at_rest
+from fab4d.design.reduced import Search, at_rest, undecided_fraction
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
 from fab4d.stages import _bring_up, _coarse, solve
@@ -312,11 +312,11 @@ def test_the_design_is_rounded_where_tets_are_small(
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize(("tolerance", "nearer"), [(0.1, 0.5), (0.1, 2.0), (0.1, None), (0.6, 0.5)])
+@pytest.mark.parametrize(("tolerance", "nearer"), [(0.1, 0.5), (0.1, 5.0), (0.1, None), (0.6, 0.5)])
 def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
     fine_bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch, tolerance: float, nearer: float | None
 ) -> None:
-    """Once more after the mesh between; the labels of that serve where it comes to nothing, or is off farther."""
+    """From the relaxed design of the mesh between; its labels serve where it comes to nothing, or is off farther."""
     monkeypatch.setattr(_coarse, "MOST_ROUNDED", 1_000)
     monkeypatch.setattr(_coarse, "ROUNDED_TETS", 1_200)
     rounded_from, n_tets, before = _bring_up.rounded_from, len(fine_bar["tets"]), list[float]()
@@ -326,6 +326,7 @@ def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
             return rounded_from(carried, *given)
         problem, final = carried.equilibria.problem, carried.design.final
         before.append(shape_error(problem, final.y).rms * problem.length)
+        assert undecided_fraction(carried.design.rho) > 0.1
         if nearer is None:
             return None
         y = problem.X_temp + nearer * (final.y - problem.X_temp)
@@ -334,9 +335,10 @@ def test_what_misses_the_tolerance_on_all_tets_is_rounded_there_too(
     monkeypatch.setattr(_bring_up, "rounded_from", rounded_off)
     found = solved(fine_bar, Goal(tolerance=tolerance, max_forces=4))
     assert len(before) == (1 if tolerance == 0.1 else 0)
-    if before:
-        off = off_by(fine_bar, found) / before[0]
-        assert off == pytest.approx(1.0) if nearer != 0.5 else off < 0.6
+    taken = bool(before) and nearer == 0.5
+    assert (undecided_fraction(found["relaxed"]["rho"]) > 0.1) == taken
+    if taken:
+        assert off_by(fine_bar, found) < 0.6 * before[0]
 
 
 @pytest.mark.usefixtures("few")
