@@ -30,6 +30,8 @@ MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # and by, the surest first, if they are at most this share: that takes fewer steps than to raise the price of all of
 # them until the last is 0 or 1, and leaves a smaller error.
 HARD_STEPS, FEW_LEFT = 2, 0.1
+# Up to this share of undecided tets is decided by and by where the steps come to nothing.
+LAST_SHARE = 0.7
 # It is rounded in half the steps of a search from the start.
 ROUND_GROWTH = 2.5
 
@@ -39,20 +41,17 @@ class Rounding:
     """How a design that was carried over is relaxed further and rounded.
 
     relax_iterations : steps of relaxing at most
-    last_share : up to this share of undecided tets is rounded where the steps come to nothing
     astray : whether steps past unstable states are taken, once those that stay are hard
     """
 
     relax_iterations: int
-    last_share: float
     astray: bool
 
 
-# The design is near already. With more tets left, the design that the elements before have rounded is the better one.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, last_share=0.05, astray=False)
-# Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there,
-# and the labels of the coarser mesh err by far more.
-FINER_MESH = Rounding(relax_iterations=6, last_share=0.5, astray=True)
+# The design is near already.
+OTHER_ELEMENTS = Rounding(relax_iterations=3, astray=False)
+# Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
+FINER_MESH = Rounding(relax_iterations=6, astray=True)
 
 Watch = Callable[[str, Search], None]
 
@@ -98,7 +97,7 @@ def rounded_from(
     problem = carried.equilibria.problem
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    settings = replace(settings, relax_iterations=how.relax_iterations, round_growth=ROUND_GROWTH)
+    settings = replace(settings, relax_iterations=how.relax_iterations, round_growth=ROUND_GROWTH, nearly=1.0)
     L, hard, held_back, tried = smoothness_matrix(problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
@@ -117,7 +116,7 @@ def rounded_from(
                 return at
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, how.last_share)
+    return decided(at, settings, LAST_SHARE)
 
 
 def _is_hard(after: Search) -> bool:

@@ -1,7 +1,7 @@
 """A design that was searched on a coarser mesh, brought to all tets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from fab4d.design.finish import FINER_MESH, rounded_from
 from fab4d.design.levels import Level, carried_up
@@ -104,7 +104,7 @@ def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goa
             further = at
         add(phase, at)
 
-    rounded = rounded_from(start, replace(settings, nearly=1.0), watch, FINER_MESH)
+    rounded = rounded_from(start, settings, watch, FINER_MESH)
     return None if rounded is None or not affordable(rounded, goal) else _Design(further, rounded)
 
 
