@@ -27,9 +27,9 @@ from fab4d.mesh.tetmesh import FloatArray
 # share of the undecided tets: the equilibria turn unstable on its way.
 MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
-# and by, the surest first, if they are at most this share: that takes fewer steps than to raise the price of all of
-# them until the last is 0 or 1, and leaves a smaller error.
-HARD_STEPS, FEW_LEFT = 2, 0.1
+# and by, the surest first, if they are few: that takes fewer steps than to raise the price of all of them until the
+# last is 0 or 1, and leaves a smaller error.
+HARD_STEPS = 2
 # Up to this share of undecided tets is decided by and by where the steps come to nothing.
 LAST_SHARE = 0.7
 # It is rounded in half the steps of a search from the start.
@@ -41,17 +41,19 @@ class Rounding:
     """How a design that was carried over is relaxed further and rounded.
 
     relax_iterations : steps of relaxing at most
+    few_left : share of undecided tets that counts as few, where steps are hard
     astray : whether steps past unstable states are taken, once those that stay are hard
     """
 
     relax_iterations: int
+    few_left: float
     astray: bool
 
 
 # The design is near already.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, astray=False)
+OTHER_ELEMENTS = Rounding(relax_iterations=3, few_left=0.1, astray=False)
 # Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
-FINER_MESH = Rounding(relax_iterations=6, astray=True)
+FINER_MESH = Rounding(relax_iterations=6, few_left=LAST_SHARE, astray=True)
 
 Watch = Callable[[str, Search], None]
 
@@ -108,7 +110,7 @@ def rounded_from(
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        if not tried and hard >= HARD_STEPS and left <= FEW_LEFT:
+        if not tried and hard >= HARD_STEPS and left <= how.few_left:
             design, tried = decided_by_and_by(at, settings), True
             if design is not None:
                 at = replace(at, design=design, phase=Phase.DONE)

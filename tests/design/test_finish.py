@@ -10,7 +10,6 @@ from bars import bar
 from fab4d.design import finish
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.finish import (
-    FEW_LEFT,
     FINER_MESH,
     MOST_HELD_BACK,
     OTHER_ELEMENTS,
@@ -20,7 +19,7 @@ from fab4d.design.finish import (
     rounded_from,
 )
 from fab4d.design.forward import balance
-from fab4d.design.gauss_newton import held_positions
+from fab4d.design.gauss_newton import Design, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem
@@ -123,7 +122,7 @@ def test_the_last_few_tets_are_decided_by_and_by_where_steps_are_hard(found: Sea
     at = rounded_from(carried, settings_for(quadratic), lambda _, at: shown.append(at))
     assert at is shown[-1]
     shares = [undecided_fraction(state.design.rho) for state in shown]
-    assert min(shares[:-2]) > FEW_LEFT >= shares[-2] > shares[-1] == 0
+    assert min(shares[:-2]) > OTHER_ELEMENTS.few_left >= shares[-2] > shares[-1] == 0
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
 
 
@@ -231,3 +230,24 @@ def test_on_finer_meshes_steps_go_astray_once_those_that_stay_are_hard(
     rounded_from(carried, settings_for(quadratic), lambda *_: None, how)
     assert steps == made
     assert [stay for _, stay in made].count(False) == 0 or dampings[1] == dampings[0]
+
+
+@pytest.mark.usefixtures("all_steps_hard")
+def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first hard step goes astray, the two after it are in a row."""
+    carried, shares = carried_in(quadratic, found), list[float]()
+    assert carried is not None
+    real = finish.decided_by_and_by
+
+    def watched(at: Search, settings: ReducedSettings) -> Design | None:
+        shares.append(undecided_fraction(at.design.rho))
+        return real(at, settings)
+
+    monkeypatch.setattr(finish, "decided_by_and_by", watched)
+    at = rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(FINER_MESH, relax_iterations=1))
+    assert len(shares) == 1
+    assert OTHER_ELEMENTS.few_left < shares[0] <= FINER_MESH.few_left
+    assert at is not None
+    assert undecided_fraction(at.design.rho) == 0
