@@ -3,25 +3,25 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-# Fitted to the seven samples (240 to 14,400 tets) on two cores with little else to do, `slice` on busy ones. All but
-# the largest sample are finished in quadratic tets, so that the laws are rough.
+# Fitted to the seven samples (240 to 14,400 tets) on two cores with little else to do. All but the largest sample are
+# finished in quadratic tets, so that the laws are rough.
 # Stage: seconds at 1,000 tets, and the power of the number of tets with which they grow.
 # A power below zero, noise of the runs, is taken as zero.
 STAGE_SECONDS: Mapping[str, tuple[float, float]] = {
-    "check": (0.641, 0.09),
-    "solve": (9.14, 0.91),
-    "threshold": (0.0327, 0.72),
-    "refit": (9.94, 0.38),
-    "verify": (0.832, 0.16),
-    "sensitivity": (1.24, 0.86),
-    "judge": (0.00974, 0.32),
-    "bodies": (0.409, 0.20),
-    "slice": (2.46, 0.42),
-    "rig": (0.208, 0.12),
-    "report": (0.261, 0.14),
+    "check": (0.606, 0.14),
+    "solve": (9.12, 0.95),
+    "threshold": (0.0321, 0.71),
+    "refit": (9.3, 0.39),
+    "verify": (0.856, 0.15),
+    "sensitivity": (1.34, 0.88),
+    "judge": (0.00927, 0.34),
+    "bodies": (0.396, 0.22),
+    "slice": (0.808, 0.50),
+    "rig": (0.206, 0.14),
+    "report": (0.258, 0.15),
 }
 # Peak memory: MB of the program itself, and MB for each 1,000 tets.
-MEMORY_MB = (1241, 54.5)
+MEMORY_MB = (1212, 54.6)
 # What a run on a mesh of so many times the tets would take is told in its report.
 FINER = (2, 8)
 
