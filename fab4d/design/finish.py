@@ -1,4 +1,4 @@
-"""A relaxed design carried over to other elements of the same mesh, and rounded there."""
+"""A relaxed design carried over to other elements or a finer mesh, and rounded there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -50,7 +50,7 @@ MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, with as many tries of a step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, DECIDED_TRIES = 0.5, 4, 3
 # Densities are rounded in steps of at least this share of the way.
-LAST_STEP = 0.1
+DECIDED_STEP = 0.1
 # Where no equilibrium leads to more of them, this share of tets may stay undecided: printing rounds them.
 LEFT_UNDECIDED = 0.02
 # Held at fewer points, a part without a clamp can turn about the line through them.
@@ -385,14 +385,14 @@ def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
             sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
             rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
             rho[sure], movable[unsure] = np.round(rho[sure]), True
-            design = change_density(equilibria, design, rho, LAST_STEP)
+            design = change_density(equilibria, design, rho, DECIDED_STEP)
             step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
             design, damping = step.design, min(step.damping, LARGEST_DAMPING)
     except EquilibriumError:
         if undecided_fraction(design.rho) > LEFT_UNDECIDED:
             return None
     try:
-        return change_density(equilibria, design, np.round(design.rho), LAST_STEP)
+        return change_density(equilibria, design, np.round(design.rho), DECIDED_STEP)
     except EquilibriumError:
         return design
 

@@ -69,7 +69,7 @@ def _one_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, ad
     """The design on the finer mesh, rounded there where it is not far off; else as it is carried over."""
     rounded = None
     if at.relaxed is not None and not far_off(at.relaxed, settings):
-        rounded = _rounded(level, at.relaxed, settings, goal, add)
+        rounded = _rounded(carried_up(level, at.relaxed), settings, goal, add)
     if rounded is not None and _rms(rounded.found) <= settings.weights.error_scale:
         return rounded
     return _better(rounded, _carried(level, at.found, add))
@@ -78,10 +78,10 @@ def _one_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, ad
 def _farther_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
     """The design on a mesh that is finer still, as it is carried over, or rounded there where that is worth it."""
     carried, tolerance = _carried(level, at.found, add), settings.weights.error_scale
-    near = carried is None or _rms(carried.found) <= WON_BY_FIT * tolerance
-    if near or _rms(at.found) > OUT_OF_REACH * tolerance:
+    if carried is None or _rms(carried.found) <= WON_BY_FIT * tolerance or _rms(at.found) > OUT_OF_REACH * tolerance:
         return carried
-    return _better(_rounded(level, at.relaxed or at.found, settings, goal, add), carried)
+    start = carried.found if at.relaxed is None else carried_up(level, at.relaxed)
+    return _better(_rounded(start, settings, goal, add), carried)
 
 
 def _carried(level: Level, at: Search, add: Add) -> _Design | None:
@@ -92,11 +92,11 @@ def _carried(level: Level, at: Search, add: Add) -> _Design | None:
     return _Design(None, carried)
 
 
-def _rounded(level: Level, relaxed: Search, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
-    """None where it finds no equilibrium on the way, or needs more SMP than the goal allows."""
-    start = further = carried_up(level, relaxed)
+def _rounded(start: Search | None, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
+    """None without a start, where it finds no equilibrium on the way, or needs more SMP than the goal allows."""
     if start is None:
         return None
+    further = start
 
     def watch(phase: str, at: Search) -> None:
         nonlocal further

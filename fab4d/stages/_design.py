@@ -27,9 +27,9 @@ LAM_SMP, LAM_SMOOTH = 0.05, 2.5
 # Limits of rig and material are penalties, exceeded a little where the error pulls: they begin below the true limit.
 LIMIT_MARGIN = 0.9
 # Surfaces that are squeezed below the first number turn unstable in short waves, which coarse meshes are too stiff to
-# show: plane ones below 0.54, evenly in all directions below 0.67 (Biot, Appl. Sci. Res. A 12 (1963) 168). A 5000th of
-# the volume squeezed to nothing counts as much as an error of the tolerance: near these states most steps lead to no
-# equilibrium, and rounding loses most of the accuracy.
+# show: plane ones below 0.54, evenly in all directions below 0.67 (Biot, Appl. Sci. Res. A 12 (1963) 168). Near
+# these states most steps lead to no equilibrium, and rounding loses most of the accuracy. A 5000th of the volume
+# squeezed to nothing counts as much as an error of the tolerance.
 LEAST_STRETCH, LAM_SQUEEZE = 0.6, 5000.0
 
 

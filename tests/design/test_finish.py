@@ -154,7 +154,7 @@ def test_tets_are_not_decided_by_and_by_where_steps_lead_on(
     assert rounded_from(carried, settings_for(quadratic), lambda *_: None) is not None
 
 
-def test_what_steps_leave_undecided_is_rounded_where_no_other_design_is(
+def test_what_steps_leave_undecided_is_rounded_up_to_a_share(
     found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After the first step of the rounding, which leaves more than the share that may be."""
@@ -229,7 +229,8 @@ def test_on_finer_meshes_steps_go_astray_once_those_that_stay_are_hard(
     assert carried is not None
     rounded_from(carried, settings_for(quadratic), lambda *_: None, how)
     assert steps == made
-    assert [stay for _, stay in made].count(False) == 0 or dampings[1] == dampings[0]
+    if how.astray:
+        assert dampings[1] == dampings[0]
 
 
 @pytest.mark.usefixtures("all_steps_hard")
