@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, vstack
 
 from fab4d.design.equilibria import Equilibria, Median
 from fab4d.design.flip_loads import FlipLoads, flip_loads
-from fab4d.design.gauss_newton import HELD_STEP, Ahead, Design
+from fab4d.design.gauss_newton import HELD_STEP, ROUNDED_OFF, Ahead, Design
 from fab4d.design.objective import (
     ObjectiveWeights,
     forces_beyond,
@@ -104,7 +104,9 @@ class View:
     @cached_property
     def gram(self) -> FloatArray:
         """(3K, 3K) what moves of the held positions cost, their effect on the shape included."""
-        return self.shape_by_held @ self.shape_by_held.T + self.ridge * np.eye(len(self.shape_by_held))
+        effect = self.shape_by_held @ self.shape_by_held.T
+        # Positions that move the shape alike make that singular, however strict the tolerance.
+        return effect + max(self.ridge, ROUNDED_OFF * np.abs(effect).max(initial=0.0)) * np.eye(len(effect))
 
     def shape(self, problem: Problem, y: FloatArray) -> FloatArray:
         """(p,) error of the final shape y (N, 3)."""

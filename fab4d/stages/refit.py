@@ -1,6 +1,6 @@
 """Stage `refit`: the held positions that are best for the labels that will be printed."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,8 +52,13 @@ FEW_STEPS = 3
 # Errors that are predicted for printed labels differ from what comes of them by up to this factor more for one than for
 # another.
 CLEARLY_WORSE = 1.1
+# What is predicted beyond this multiple of the error before is as likely a failure of the prediction.
+NOT_TRUE = 3.0
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
+# Of up to so many tets each counts, and where flips end is chance: they begin again from other labels there, as long
+# as they do not reach the goal, for that takes seconds.
+FEW_TETS = 1_000
 NOT_HELD = "the design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
 Polish = Callable[[Equilibria, Design], Design]
 
@@ -70,19 +75,17 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
     settings = _flip_settings(inputs, profile, rounding, weights)
-    first = _printed_design(equilibria, relaxed, rounded["smp"], weights, settings)
-    design = first.fitted
-    trace.add("printed", Search(equilibria, first.design))
-    trace.add("refit", Search(equilibria, design))
+    begin = _printed_designs(equilibria, relaxed, rounded["smp"], weights, settings)
+    polish = _polish(weights, settings, trace)
+    design = _best_flipped(equilibria, begin, polish, settings, trace)
     fit = _Fit(equilibria, design)
     if equilibria.patches.count:
-        radius, polish = float(relaxed["patch_radius"]) / problem.length, _polish(weights, settings, trace)
+        radius = float(relaxed["patch_radius"]) / problem.length
         if problem is not rounding:
-            design = polish(equilibria, refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
             carried = _in_elements_of(problem, Search(equilibria, design))
             trace.add("carried over", carried)
-            equilibria, design = carried.equilibria, carried.design
             polish = _polish(weights, replace(settings, target_rms=weights.error_scale, rounds=FEW_ROUNDS), trace)
+            equilibria, design = carried.equilibria, polish(carried.equilibria, carried.design)
         fit = _reachable_fit(equilibria, design, weights, radius, polish, trace)
     equilibria, smp = fit.equilibria, fit.design.rho > 0.5
     design = polished(equilibria, fit.design)
@@ -115,14 +118,39 @@ class _Printed:
     fitted: Design
 
 
-def _printed_design(
+def _best_flipped(
+    equilibria: Equilibria, begin: Iterable[_Printed], polish: Polish, settings: FlipSettings, trace: Trace
+) -> Design:
+    """The best of the designs that flips make of those to `begin` with, the first that comes to the goal.
+
+    Without points there are no held positions to follow flips, and the first is as good as any.
+    """
+    problem, ends = equilibria.problem, list[Design]()
+
+    def rms_of(design: Design) -> float:
+        return shape_error(problem, design.final.y).rms
+
+    for printed in begin:
+        trace.add("printed", Search(equilibria, printed.design))
+        trace.add("refit", Search(equilibria, printed.fitted))
+        if not equilibria.patches.count:
+            return printed.fitted
+        ends.append(polish(equilibria, printed.fitted))
+        if rms_of(ends[-1]) <= settings.target_rms:
+            break
+    return min(ends, key=rms_of)
+
+
+def _printed_designs(
     equilibria: Equilibria,
     relaxed: Mapping[str, np.ndarray],
     smp: BoolArray,
     weights: ObjectiveWeights,
     settings: FlipSettings,
-) -> _Printed:
+) -> Iterator[_Printed]:
     """Labels near the printable ones smp (m,) in equilibrium: near the relaxed design, or where loading from rest ends.
+
+    The one to begin with first; of few tets, others after it.
 
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
     short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair; as
@@ -132,13 +160,15 @@ def _printed_design(
     problem, rho = equilibria.problem, smp.astype(np.float64)
     design = _carried(equilibria, relaxed, rho) if problem.n_tets > MANY_TETS else None
     if design is not None:
-        return _Printed(design, design)
+        yield _Printed(design, design)
+        return
     before, found = _relaxed_design(equilibria, relaxed), list[_Printed]()
 
     def rms_of(printed: _Printed) -> float:
         return shape_error(problem, printed.fitted.final.y).rms
 
-    for followed in _ways(equilibria, before, smp, weights, settings):
+    ways = _ways(equilibria, before, smp, weights, settings)
+    for followed in ways:
         found += [] if followed is None else [followed]
         if min(map(rms_of, found), default=np.inf) <= WITHIN_REACH * settings.target_rms:
             break
@@ -147,8 +177,12 @@ def _printed_design(
         found = [] if followed is None else [followed]
     if not found:
         design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
-        return _Printed(design, design)
-    return min(found, key=rms_of)
+        found = [_Printed(design, design)]
+    first = min(found, key=rms_of)
+    yield first
+    if problem.n_tets <= FEW_TETS:
+        yield from (each for each in found if each is not first)
+        yield from (each for each in ways if each is not None)
 
 
 def _ways(
@@ -157,21 +191,23 @@ def _ways(
     """Printable labels near a near 0/1 design, one after the other, for each takes a while; None where it fails.
 
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
-    changes. What is predicted to be no better than what was found, or clearly worse than what was predicted of another
-    that was followed, is left out.
+    changes. Of more than FEW_TETS, what is predicted to be no better than what was found, or clearly worse than what
+    was predicted of another that was followed, is left out if that can be true.
     """
+    problem, few = equilibria.problem, equilibria.problem.n_tets <= FEW_TETS
+    most = NOT_TRUE * shape_error(problem, before.final.y).rms
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
     best = promised = np.inf
-    for labels in _repairs(equilibria.problem, flips, rounded, smp, settings):
+    for labels in _repairs(problem, flips, rounded, smp, settings):
         left = 0.0 if flips is None else error_left(flips, rounded, labels)
-        worse = left >= best or left > CLEARLY_WORSE * promised
-        if worse or any((labels == other).all() for other in tried):
+        worse = left <= most and (left >= best or left > CLEARLY_WORSE * promised)
+        if (worse and not few) or any((labels == other).all() for other in tried):
             continue
         tried.append(labels)
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
         if followed is not None:
-            best = min(best, shape_error(equilibria.problem, followed.fitted.final.y).rms)
+            best = min(best, shape_error(problem, followed.fitted.final.y).rms)
             promised = min(promised, left)
         yield followed
 
@@ -246,16 +282,15 @@ class _Fit:
 def _reachable_fit(
     equilibria: Equilibria, design: Design, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace
 ) -> _Fit:
-    """Fit positions and labels, and simulate the loading to them: the state in which that ends is what the rig gets.
+    """Simulate the loading to a fitted design: the state in which that ends is what the rig gets.
 
     radius : of a patch, L0
     Where it is another equilibrium than the fit's, and misses the tolerance, a point moves to where the two differ
-    most, or else the fit goes on from where loading ended. The state nearest to the temporary shape among those that
-    loading ended in; the last fit where no loading went all the way.
+    most, or else positions and labels are fitted again from where loading ended. The state nearest to the temporary
+    shape among those that loading ended in; the last fit where no loading went all the way.
     """
     ends, missed = list[tuple[float, _Fit]](), np.inf
     for fits in range(1, MOST_FITS + 1):
-        design = polish(equilibria, refit(equilibria, design, weights, lambda at: trace.add("refit", at)))
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         end = _programmed(done, design.rho)
         rms = shape_error(equilibria.problem, end.final.y).rms
@@ -269,6 +304,7 @@ def _reachable_fit(
             break
         if fits < MOST_FITS:
             equilibria, design = _begun_again(equilibria, design, end, whole, weights, radius)
+            design = polish(equilibria, design)
     nearest = min(ends, key=lambda each: each[0])[1] if ends else _Fit(equilibria, design)
     return replace(nearest, fits=fits, missed=missed)
 
@@ -309,10 +345,13 @@ def _flip_settings(
 
 
 def _polish(weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Polish:
-    """A function that flips labels of a fitted design as long as that brings it nearer to the temporary shape."""
-    return lambda equilibria, design: polish_labels(
-        equilibria, design, weights, settings, lambda at: trace.add("flips", at)
-    )
+    """A function that fits held positions, and flips labels as long as that brings the temporary shape nearer."""
+
+    def polish(equilibria: Equilibria, design: Design) -> Design:
+        fitted = refit(equilibria, design, weights, lambda at: trace.add("refit", at))
+        return polish_labels(equilibria, fitted, weights, settings, lambda at: trace.add("flips", at))
+
+    return polish
 
 
 def flipped_down_to(relaxed_rms: float, tolerance: float, n_tets: int) -> float:

@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,7 @@ def test_what_is_too_large_to_round_in_quadratic_elements_is_fitted_in_them(
         return design
 
     monkeypatch.setattr(refit, "polish_labels", spy)
+    monkeypatch.setattr(refit, "FEW_TETS", 0)
     monkeypatch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
     found = refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
     (first, target, many), *others = targets
@@ -142,7 +144,7 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     smp = inputs["rounded"]["smp"]
     given = (equilibria, inputs["relaxed"], smp, weights, settings)
     monkeypatch.setattr(refit, "influence_near", lambda *_: None)
-    by_path = refit._printed_design(*given).design
+    by_path = next(refit._printed_designs(*given)).design
 
     def not_taken(*_: Any) -> Design:
         raise AssertionError
@@ -150,13 +152,13 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     monkeypatch.setattr(refit, "MANY_TETS", 1)
     for path in ("change_density", "follow_density"):
         monkeypatch.setattr(refit, path, not_taken)
-    at_once = refit._printed_design(*given).design
+    at_once = next(refit._printed_designs(*given)).design
     np.testing.assert_allclose(at_once.median.x, by_path.median.x, atol=1e-5)
     R, t = best_rigid_motion(at_once.final.y, by_path.final.y)
     np.testing.assert_allclose(at_once.final.y @ R.T + t, by_path.final.y, atol=1e-5)
     monkeypatch.setattr(refit, "carried_over", lambda *_: None)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
-        refit._printed_design(*given)
+        next(refit._printed_designs(*given))
 
 
 def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
@@ -187,7 +189,7 @@ def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
 
         monkeypatch.setattr(refit, "follow_density", quickly)
         monkeypatch.setattr(refit, "change_density", patient)
-        return refit._printed_design(equilibria, inputs["relaxed"], smp, weights, settings).design
+        return next(refit._printed_designs(equilibria, inputs["relaxed"], smp, weights, settings)).design
 
     at_once = found_by({False, True})
     assert not any(asked)
@@ -210,7 +212,7 @@ def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     spoilt[np.flatnonzero(at_interface(problem, spoilt))[::12]] ^= True
     before = refit._relaxed_design(equilibria, inputs["relaxed"])
     as_they_are = change_density(equilibria, before, spoilt.astype(np.float64))
-    printed = refit._printed_design(equilibria, inputs["relaxed"], spoilt, weights, settings).design
+    printed = next(refit._printed_designs(equilibria, inputs["relaxed"], spoilt, weights, settings)).design
     fits = [refit.refit(equilibria, each, weights, lambda at: None) for each in (as_they_are, printed)]  # noqa: ARG005
     # Fits of the same labels end as near to each other as a fit ends to the best held positions.
     unchanged = np.array_equal(printed.rho, as_they_are.rho)
@@ -229,7 +231,7 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
     monkeypatch.setattr(refit, "error_left", lambda *_: 0.0)  # all promise enough
     labels = [inputs["rounded"]["smp"], inputs["rounded"]["smp"].copy()]
     labels[1][np.flatnonzero(at_interface(problem, labels[0]))[::2]] ^= True
-    made = [refit._printed_design(equilibria, inputs["relaxed"], smp, weights, enough) for smp in labels]
+    made = [next(refit._printed_designs(equilibria, inputs["relaxed"], smp, weights, enough)) for smp in labels]
     best, worst = np.argsort([rms(problem, each.fitted) for each in made])
     asked: list[BoolArray] = []
 
@@ -239,11 +241,11 @@ def test_labels_are_mended_otherwise_where_their_repair_costs_much(
 
     monkeypatch.setattr(refit, "mended", mended)
     for target, taken in ((enough, worst), (never, best)):
-        printed = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, target)
+        printed = next(refit._printed_designs(equilibria, inputs["relaxed"], labels[worst], weights, target))
         np.testing.assert_array_equal(printed.design.rho > 0.5, labels[taken])
         assert bool(asked) == (target is never)
     monkeypatch.setattr(refit, "mended", lambda *_: labels[worst])
-    same = refit._printed_design(equilibria, inputs["relaxed"], labels[worst], weights, never)
+    same = next(refit._printed_designs(equilibria, inputs["relaxed"], labels[worst], weights, never))
     np.testing.assert_array_equal(same.design.rho > 0.5, labels[worst])
 
 
@@ -279,7 +281,7 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
         monkeypatch.setattr(refit, "mended", lambda *_, labels=last: labels)
         tried.clear()
         target = share * rms(problem, design) / refit.WITHIN_REACH
-        refit._printed_design(equilibria, inputs["relaxed"], smp, weights, replace(settings, target_rms=target))
+        next(refit._printed_designs(equilibria, inputs["relaxed"], smp, weights, replace(settings, target_rms=target)))
         assert len(tried) == len(ways)
         assert all(np.array_equal(got, way) for got, way in zip(tried, ways, strict=True))
 
@@ -291,12 +293,16 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
         ((0.95, 0.99, 0.97), [0, 1, 2]),
         ((0.5, 1.11 * 0.5, 1.09 * 0.5), [0, 2]),
         ((0.5, 0.4, 1.11 * 0.4), [0, 1]),
+        ((0.95, 3.5, 1.01), [0, 1]),
     ],
 )
 def test_labels_that_are_predicted_to_be_no_better_than_what_was_found_are_not_followed(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, promises: tuple[float, ...], ways: list[int]
 ) -> None:
-    """Nor those predicted to be clearly worse than the best that was followed. All come to 1, which is too much."""
+    """Nor those predicted to be clearly worse than the best that was followed. All come to 1, which is too much.
+
+    Of few tets all are, and so are those of which more is predicted than can be true.
+    """
     equilibria, weights, settings = fit_of(inputs)
     smp = inputs["rounded"]["smp"]
     labels = [smp.copy(), smp.copy(), smp]
@@ -320,8 +326,53 @@ def test_labels_that_are_predicted_to_be_no_better_than_what_was_found_are_not_f
     )
     monkeypatch.setattr(refit, "_followed", followed)
     never = replace(settings, target_rms=0.0)
-    refit._printed_design(equilibria, inputs["relaxed"], smp, weights, never)
-    assert tried == ways
+    for few, expected in ((0, ways), (equilibria.problem.n_tets, [0, 1, 2])):
+        tried.clear()
+        monkeypatch.setattr(refit, "FEW_TETS", few)
+        next(refit._printed_designs(equilibria, inputs["relaxed"], smp, weights, never))
+        assert tried == expected
+
+
+@pytest.mark.parametrize(("goal", "begun"), [(0.5, [0, 1, 2]), (1.5, [0, 1]), (2.5, [0])])
+def test_flips_begin_again_until_they_come_to_the_goal(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, goal: float, begun: list[int]
+) -> None:
+    """goal : the error at which they end; they come to 2, 1 and 3, and the least is taken."""
+    equilibria, _, settings = fit_of(inputs)
+    first = refit._relaxed_design(equilibria, inputs["relaxed"])
+    designs = [first, replace(first), replace(first)]
+    errors = {id(design): error for design, error in zip(designs, (2.0, 1.0, 3.0), strict=True)}
+    monkeypatch.setattr(refit, "shape_error", lambda _, y: SimpleNamespace(rms=errors[y]))
+    ends = iter([replace(each, final=replace(each.final, y=id(each))) for each in designs])
+    polished_from = list[Design]()
+
+    def polish(_: Equilibria, design: Design) -> Design:
+        polished_from.append(design)
+        return next(ends)
+
+    trace = SimpleNamespace(add=lambda *_: None)
+    begin = (refit._Printed(each, each) for each in designs)
+    best = refit._best_flipped(equilibria, begin, polish, replace(settings, target_rms=goal), trace)
+    assert [designs.index(each) for each in polished_from] == begun
+    assert errors[best.final.y] == min(errors[id(designs[k])] for k in begun)
+
+
+@pytest.mark.parametrize(("few", "more"), [(0, False), (10_000, True)])
+def test_other_labels_to_begin_with_are_those_of_few_tets(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, few: int, more: bool
+) -> None:
+    """The nearest first; none twice."""
+    equilibria, weights, settings = fit_of(inputs)
+    monkeypatch.setattr(refit, "FEW_TETS", few)
+    given = (equilibria, inputs["relaxed"], inputs["rounded"]["smp"], weights)
+    first, *others = list(refit._printed_designs(*given, replace(settings, target_rms=1.0)))
+    assert bool(others) == more
+    first, *others = list(refit._printed_designs(*given, replace(settings, target_rms=0.0)))
+    assert bool(others) == more
+    errors = [rms(equilibria.problem, each.fitted) for each in (first, *others)]
+    assert min(errors) == errors[0]
+    labels = {each.design.rho.tobytes() for each in (first, *others)}
+    assert len(labels) == 1 + len(others)
 
 
 def rms(problem: Problem, design: Design) -> float:
@@ -437,6 +488,7 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
 ) -> None:
     """With little patience below 0.15 of the tolerance, and below the tolerance where there are many unknowns."""
     monkeypatch.setattr(refit, "MANY_DOFS", most)
+    monkeypatch.setattr(refit, "FEW_TETS", 0)
     targets = []
 
     def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001
