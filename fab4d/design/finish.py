@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -28,7 +29,8 @@ from fab4d.mesh.tetmesh import FloatArray
 MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
 # and by, the surest first, if they are few: that takes fewer steps than to raise the price of all of them until the
-# last is 0 or 1, and leaves a smaller error.
+# last is 0 or 1, and leaves a smaller error. So they are at once where relaxing led past unstable states: rounding
+# would.
 HARD_STEPS = 2
 # Up to this share of undecided tets is decided by and by where the steps come to nothing.
 LAST_SHARE = 0.7
@@ -105,17 +107,15 @@ def rounded_from(
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
         if how.astray and before.stay and _is_hard(at):
-            at = replace(at if at.accepted else before, stay=False, damping=FIRST_DAMPING)
-            continue
+            at = replace(at if at.accepted else before, stay=False, damping=FIRST_DAMPING, accepted=True)
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        if not tried and hard >= HARD_STEPS and left <= how.few_left:
-            design, tried = decided_by_and_by(at, settings), True
-            if design is not None:
-                at = replace(at, design=design, phase=Phase.DONE)
-                watch(before.phase.value, at)
-                return at
+        gone_astray = before.phase is Phase.RELAX and at.phase is Phase.ROUND and not at.stay
+        if not tried and (hard >= HARD_STEPS or gone_astray) and left <= how.few_left:
+            found, tried = decided_by_and_by(at, settings, partial(watch, Phase.ROUND.value)), True
+            if found is not None:
+                return found
         if held_back == MOST_HELD_BACK:
             break
     return decided(at, settings, LAST_SHARE)

@@ -40,8 +40,15 @@ def change_density(
     smallest : share of the way that a step may come down to        stay : see `newton`
     Raises EquilibriumError when the path ends before.
     """
+    return _arrived(*toward_density(equilibria, design, rho, smallest, stay))
+
+
+def toward_density(
+    equilibria: Equilibria, design: Design, rho: FloatArray, smallest: float, stay: bool = False
+) -> tuple[Design, float]:
+    """As `change_density`, as far as the path leads: the design there, and its share of the way."""
     held = held_positions(equilibria, design.median)
-    return _arrived(*_along(design, 0.0, _by_unloading(equilibria, rho, held, stay), smallest))
+    return _along(design, 0.0, _by_unloading(equilibria, rho, held, stay), smallest)
 
 
 def follow_density(

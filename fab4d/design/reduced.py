@@ -20,7 +20,7 @@ from fab4d.design.gauss_newton import (
 )
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix, stretch_excess
 from fab4d.design.patches import Patches, build_patches, spread_centers
-from fab4d.design.paths import change_density
+from fab4d.design.paths import toward_density
 from fab4d.design.problem import Problem
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.measures import face_area_vectors
@@ -47,10 +47,12 @@ DEARER = 0.86
 # So many rounding steps in a row that come to nothing end it: the equilibria turn unstable on its way. These are steps
 # that are not taken, or taken with the largest damping and less than this share of the undecided tets decided.
 MOST_STUCK, LEAST_DECIDED = 3, 0.02
-# Of what is left then, this share is rounded at a time, or so many tets, with as many tries of a step that follows.
-DECIDED_SHARE, FEWEST_DECIDED, DECIDED_TRIES = 0.5, 4, 3
-# Densities are rounded in steps of at least this share of the way.
-DECIDED_STEP = 0.1
+# Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
+# step that follows.
+DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
+# Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
+# clear the way for others, but not so many times in a row.
+DECIDED_STEP, MOST_BARRED = 0.1, 3
 # Where no equilibrium leads to more of them, this share of tets may stay undecided: printing rounds them.
 LEFT_UNDECIDED = 0.02
 # Held at fewer points, a part without a clamp can turn about the line through them.
@@ -362,39 +364,35 @@ def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search 
     left = undecided_fraction(at.design.rho)
     if left <= settings.undecided_fraction:
         return at
-    if left > most:
-        return None
-    try:
-        design = decided_by_and_by(at, settings) or change_density(at.equilibria, at.design, np.round(at.design.rho))
-    except EquilibriumError:
-        return None
-    return replace(at, design=design, phase=Phase.DONE)
+    return None if left > most else decided_by_and_by(at, settings)
 
 
-def decided_by_and_by(at: Search, settings: ReducedSettings) -> Design | None:
+def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lambda at: None) -> Search | None:  # noqa: ARG005
     """The surest densities rounded first; the others and the held positions make up for it.
 
+    watch : is shown the state after each step
     Where no equilibrium leads on, the last few stay undecided; None where they are more than LEFT_UNDECIDED. Densities
     that are nearly 0 or 1 stay so where they cannot all be.
     """
-    equilibria, design, damping = at.equilibria, at.design, at.damping
-    weights, L = _rounding_weights(at, settings).replace(lam_round=0.0), smoothness_matrix(equilibria.problem)
-    try:
-        while (left := np.flatnonzero(_undecided(design.rho))).size:
-            count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED)
-            sure, unsure = np.split(left[np.argsort(-np.abs(design.rho[left] - 0.5), kind="stable")], [count])
-            rho, movable = design.rho.copy(), np.zeros(len(design.rho), bool)
-            rho[sure], movable[unsure] = np.round(rho[sure]), True
-            design = change_density(equilibria, design, rho, DECIDED_STEP)
-            step = gauss_newton_step(equilibria, weights, L, design, damping, movable, DECIDED_TRIES, stay=at.stay)
-            design, damping = step.design, min(step.damping, LARGEST_DAMPING)
-    except EquilibriumError:
-        if undecided_fraction(design.rho) > LEFT_UNDECIDED:
-            return None
-    try:
-        return change_density(equilibria, design, np.round(design.rho), DECIDED_STEP)
-    except EquilibriumError:
-        return design
+    equilibria, weights = at.equilibria, _rounding_weights(at, settings).replace(lam_round=0.0)
+    L, barred = smoothness_matrix(equilibria.problem), 0
+    while (left := np.flatnonzero(_undecided(at.design.rho))).size and barred < MOST_BARRED:
+        count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
+        sure, unsure = np.split(left[np.argsort(-np.abs(at.design.rho[left] - 0.5), kind="stable")], [count])
+        rho, movable = at.design.rho.copy(), np.zeros(len(at.design.rho), bool)
+        rho[sure], movable[unsure] = np.round(rho[sure]), True
+        design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP)
+        barred = 0 if done == 1.0 else barred + 1
+        step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=at.stay)
+        damping = min(step.damping, LARGEST_DAMPING)
+        at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
+        watch(at)
+    if left.size and undecided_fraction(at.design.rho) > LEFT_UNDECIDED:
+        return None
+    design, done = toward_density(equilibria, at.design, np.round(at.design.rho), DECIDED_STEP)
+    found = replace(at, design=design if done == 1.0 else at.design, phase=Phase.DONE)
+    watch(found)
+    return found
 
 
 # -- refit

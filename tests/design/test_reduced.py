@@ -296,18 +296,16 @@ def test_going_on_from_any_state_ends_with_the_same_bits(truth: Truth, searched:
 def test_rounding_ends_where_no_step_is_taken(
     truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One step that is refused is followed by others; three in a row end it, and the best state is rounded at once."""
+    """One step that is refused is followed by others; three in a row end it, and the best state is rounded."""
     before = next(at for at in searched if at.phase is Phase.ROUND and at.iteration == 2)
-    refused: list[int] = []
+    states: list[Search] = []
 
-    def refuse(_: object, __: object, ___: object, design: Design, damping: float, **____: object) -> gauss_newton.Step:
-        refused.append(1)
-        return gauss_newton.Step(design, np.inf, damping, False)
+    def refuse(*given: Any, **_: object) -> gauss_newton.Step:
+        return gauss_newton.Step(given[3], np.inf, given[4], False)
 
     monkeypatch.setattr(reduced, "gauss_newton_step", refuse)
-    monkeypatch.setattr(reduced, "decided_by_and_by", lambda *_: None)
-    found = solve_reduced(truth.problem, settings_for(truth.problem), lambda at: None, before)  # noqa: ARG005
-    assert len(refused) == 3
+    found = solve_reduced(truth.problem, settings_for(truth.problem), states.append, before)
+    assert len(states) == 3
     assert found.phase is Phase.DONE
     np.testing.assert_array_equal(found.design.rho, np.round(before.design.rho))
 
@@ -344,19 +342,16 @@ def test_rounding_spends_little_more_than_the_relaxed_error_but_asks_for_no_tiny
     assert weights.error_scale == pytest.approx(scale * tolerance)
 
 
-def test_densities_left_undecided_are_rounded_at_once(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where the steps have come to nothing and they cannot be decided by and by; but only up to a share, if given."""
+def test_densities_left_undecided_are_rounded(truth: Truth, searched: list[Search]) -> None:
+    """Where the steps have come to nothing; but only up to a share, if given."""
     last, problem = searched[-1], truth.problem
     rho = np.round(last.design.rho)
     rho[:12] = np.abs(rho[:12] - 0.3)
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
     settings = settings_for(problem)
-    assert decided(ended, settings, 12 / 120) is not None
-    monkeypatch.setattr(reduced, "decided_by_and_by", lambda *_: None)
     found = solve_reduced(problem, settings, lambda at: None, ended)  # noqa: ARG005
-    np.testing.assert_array_equal(found.design.rho, np.round(rho))
+    assert set(np.unique(found.design.rho)) == {0.0, 1.0}
+    np.testing.assert_array_equal(found.design.rho[12:], rho[12:])
     assert balance(found.equilibria, found.design.rho, found.design.median, found.design.final).final < 1e-5
     assert decided(ended, settings, 12 / 120) is not None
     assert decided(ended, settings, 11 / 120) is None
@@ -381,27 +376,43 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     assert rms(problem, by_and_by.design) < rms(problem, at_once)
 
 
-def lost_at(call: int, monkeypatch: pytest.MonkeyPatch, last: int | None = None) -> None:
-    """Makes this call of change_density, or all to the last, find no equilibrium; steps leave the design as it is."""
+def lost_at(call: int, monkeypatch: pytest.MonkeyPatch, last: int, share: float = 0.0) -> None:
+    """Makes calls of toward_density, from this one to the last, end at a share of the way; steps change nothing."""
     calls = itertools.count(1)
 
-    def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float) -> Design:
-        if call <= next(calls) <= (call if last is None else last):
-            raise EquilibriumError
-        return replace(design, rho=rho)
+    def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float) -> tuple[Design, float]:
+        done = share if call <= next(calls) <= last else 1.0
+        return replace(design, rho=design.rho + done * (rho - design.rho)), done
 
-    monkeypatch.setattr(reduced, "change_density", follow)
+    monkeypatch.setattr(reduced, "toward_density", follow)
     monkeypatch.setattr(reduced, "gauss_newton_step", lambda *given, **_: gauss_newton.Step(given[3], 0.0, 1.0, True))
 
 
-@pytest.mark.parametrize("lost", [1, 2])
-def test_without_an_equilibrium_nothing_is_decided_by_and_by(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, lost: int
+@pytest.mark.parametrize(
+    ("lost", "times", "ends"), [(1, 3, True), (2, 3, True), (1, 2, False), (2, 2, False), (3, 9, True)]
+)
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_nothing_is_decided_by_and_by_where_the_way_ends_too_often(
+    truth: Truth,
+    searched: list[Search],
+    monkeypatch: pytest.MonkeyPatch,
+    lost: int,
+    times: int,
+    ends: bool,
+    share: float,
 ) -> None:
+    """Three times in a row; before that, what the steps have changed may lead on."""
     last = searched[-1]
     undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)))
-    lost_at(lost, monkeypatch)
-    assert decided_by_and_by(undecided, settings_for(truth.problem)) is None
+    lost_at(lost, monkeypatch, lost + times - 1, share)
+    shown: list[Search] = []
+    found = decided_by_and_by(undecided, settings_for(truth.problem), shown.append)
+    assert (found is None) == ends
+    assert all(at.iteration > undecided.iteration for at in shown)
+    if found is not None:
+        assert found is shown[-1]
+        assert found.phase is Phase.DONE
+        np.testing.assert_allclose(found.design.rho, np.round(last.design.rho))
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.05, True), (0.0, False)])
@@ -414,10 +425,10 @@ def test_the_last_few_stay_undecided_where_no_equilibrium_leads_on(
     rho[:12] = np.abs(rho[:12] - np.linspace(0.3, 0.4, 12))
     lost_at(2, monkeypatch, last=9)
     monkeypatch.setattr(reduced, "LEFT_UNDECIDED", share)
-    design = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
-    assert (design is not None) is kept
-    if design is not None:
-        assert undecided_fraction(design.rho) == 6 / truth.problem.n_tets
+    found = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    assert (found is not None) is kept
+    if found is not None:
+        assert undecided_fraction(found.design.rho) == 6 / truth.problem.n_tets
 
 
 def test_what_is_nearly_decided_stays_so_where_it_cannot_all_be(
@@ -427,10 +438,10 @@ def test_what_is_nearly_decided_stays_so_where_it_cannot_all_be(
     last = searched[-1]
     rho = np.abs(np.round(last.design.rho) - 1e-3)
     rho[:2] = 0.3
-    lost_at(2, monkeypatch)
-    design = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
-    assert design is not None
-    np.testing.assert_array_equal(design.rho, np.r_[0.0, 0.0, rho[2:]])
+    lost_at(2, monkeypatch, last=2)
+    found = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    assert found is not None
+    np.testing.assert_array_equal(found.design.rho, np.r_[0.0, 0.0, rho[2:]])
 
 
 def test_refit_recovers_the_held_positions_of_the_truth(truth: Truth) -> None:
