@@ -54,6 +54,8 @@ class Rounding:
 
 # The design is near already.
 OTHER_ELEMENTS = Rounding(relax_iterations=3, few_left=0.1, astray=False)
+# Where other elements have been searched themselves, steps are hard because of them.
+SEARCHED = Rounding(relax_iterations=0, few_left=1.0, astray=False)
 # Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
 FINER_MESH = Rounding(relax_iterations=6, few_left=LAST_SHARE, astray=True)
 
@@ -98,11 +100,15 @@ def rounded_from(
     watch : is shown the phase and the state after each step
     None where no equilibria lead to 0 and 1.
     """
-    problem = carried.equilibria.problem
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    settings = replace(settings, relax_iterations=how.relax_iterations, round_growth=ROUND_GROWTH, nearly=1.0)
-    L, hard, held_back, tried = smoothness_matrix(problem), 0, 0, False
+    return rounded_on(at, replace(settings, relax_iterations=how.relax_iterations, nearly=1.0), watch, how)
+
+
+def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
+    """As `rounded_from`, from any state of a search in the elements of the result."""
+    settings = replace(settings, round_growth=ROUND_GROWTH)
+    L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
@@ -118,7 +124,7 @@ def rounded_from(
                 return found
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, LAST_SHARE)
+    return decided(at, settings, max(how.few_left, LAST_SHARE))
 
 
 def _is_hard(after: Search) -> bool:

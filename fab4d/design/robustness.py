@@ -23,7 +23,8 @@ MOST_FORCE_STEPS, SMALLEST_DAMPING = 8, 0.05
 # A step to changed forces moves the points no farther than this, in L0, and is given up where the shape does not follow
 # in a few steps: then it has none to follow to.
 LONGEST_MOVE, FEW_NEWTON_STEPS = 0.1, 6
-# In how many parts a change of the forces is made, the second time because the first one failed.
+# In how many parts a change of the forces is made, the second time because the first one failed, or at once where it
+# moves a point farther than LONGEST_MOVE.
 FORCE_PARTS = 1, 4
 
 
@@ -142,8 +143,9 @@ def with_moved_points(
     x, f, y = design.median.x, design.median.forces, design.final.y
     dx, df, dy = (part.reshape(-1, 3) for part in (response.dx_dc @ d, response.df_dc @ d, response.dy_dc @ d))
     ahead = equilibria.held_turning.step(x, dx), f + df, equilibria.free_turning.step(y, dy)
-    for guess in (ahead, (x, f, y)):
-        found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS, near=near)
+    # From far ahead the way past unstable states is long, and the other one mostly leads there too.
+    for guess, stay in ((ahead, True), ((x, f, y), False)):
+        found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS, stay=stay, near=near)
         if found is not None:
             return found
     return None
@@ -159,11 +161,14 @@ def with_scaled_modulus(
     return equilibrate(other, design.rho, held, x, f, y, SEARCH_TOLERANCE, NEWTON_STEPS, near=near)
 
 
-def with_scaled_forces(equilibria: Equilibria, design: Design, near: Linearisation, factor: float) -> Design | None:
+def with_scaled_forces(
+    equilibria: Equilibria, design: Design, near: Linearisation, response: Response, factor: float
+) -> Design | None:
     """The design with `factor` times its forces; None where no path of equilibria leads there."""
     problem = equilibria.problem
     turning = Turning(problem.body, np.flatnonzero(problem.clamp), equilibria.operator[:0])
-    for parts in FORCE_PARTS:
+    travel = np.linalg.norm(response.moves_for_forces((factor - 1) * design.median.forces), axis=1).max(initial=0.0)
+    for parts in FORCE_PARTS[int(travel > LONGEST_MOVE) :]:
         median: Median | None = design.median
         for share in np.linspace(0, 1, parts + 1)[1:]:
             wanted = (1 + share * (factor - 1)) * design.median.forces

@@ -205,7 +205,9 @@ def _force_figures(equilibria: Equilibria, design: Design, lin: Linearisation, r
         model = _by_model(response, change * design.median.forces, L0) | {"simulated": simulated}
         if not simulated:
             return model | {"rms_mm": None}
-        return model | {"rms_mm": _rms_mm(equilibria, with_scaled_forces(equilibria, design, lin, 1 + change))}
+        return model | {
+            "rms_mm": _rms_mm(equilibria, with_scaled_forces(equilibria, design, lin, response, 1 + change))
+        }
 
     def alone(point: int) -> dict[str, float]:
         force = _alone(equilibria.patches.count, point, FORCE_CHANGE * design.median.forces[point])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import carried_in, rounded_from
+from fab4d.design.finish import SEARCHED, carried_in, rounded_from, rounded_on
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
@@ -244,7 +244,31 @@ def _finished(
         trace.add("carried over", carried)
         return _Finish(left_out=(LINEAR_ROUNDS,))
     finished = rounded_from(carried, settings, trace.add)
+    if finished is None and _rms(carried) > settings.weights.error_scale:
+        finished = _found_in(carried.equilibria.problem, settings, trace)
     return _Finish(finished if affordable(finished, profile["goal"]) else None)
+
+
+def _found_in(problem: Problem, settings: ReducedSettings, trace: Trace) -> Search | None:
+    """A near 0/1 design searched from the start; None where none is found, or the relaxed one misses the tolerance.
+
+    It takes minutes, but what linear elements find is of no use where they lock: quadratic ones miss the tolerance with
+    it, and steps from there lead past unstable states.
+    """
+    phase = "start"
+
+    def show(at: Search) -> None:
+        nonlocal phase
+        trace.add(phase, at)
+        phase = at.phase.value
+
+    try:
+        at = relaxed(problem, replace(settings, centers=None), show)
+    except EquilibriumError:
+        return None
+    if at.relaxed_rms > settings.weights.error_scale:
+        return None
+    return rounded_on(at, settings, trace.add, SEARCHED)
 
 
 def _picked(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fab4d.design import robustness
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import Equilibria, Median
 from fab4d.design.forward import balance
 from fab4d.design.gauss_newton import Design, equilibrate, held_positions
 from fab4d.design.objective import shape_error
@@ -36,6 +36,10 @@ def maps(equilibria: Equilibria, design: Design) -> Linearisation:
 
 def response_of(equilibria: Equilibria, design: Design) -> Response:
     return robustness.response_of(equilibria, design, maps(equilibria, design))
+
+
+def scaled_forces(equilibria: Equilibria, design: Design, factor: float) -> Design | None:
+    return with_scaled_forces(equilibria, design, maps(equilibria, design), response_of(equilibria, design), factor)
 
 
 @pytest.fixture(scope="module", params=["linear", "quadratic"])
@@ -227,7 +231,7 @@ def test_no_change_gives_the_same_error(bent: tuple[Equilibria, Design]) -> None
     none = np.zeros((equilibria.patches.count, 3))
     same = [
         with_moved_points(equilibria, design, maps(equilibria, design), response, none),
-        with_scaled_forces(equilibria, design, maps(equilibria, design), 1.0),
+        with_scaled_forces(equilibria, design, maps(equilibria, design), response, 1.0),
         *(with_scaled_modulus(equilibria, design, maps(equilibria, design), phase, 1.0) for phase in PHASES),
     ]
     assert response.rms_after(none) == response.rms == rms(equilibria, design)
@@ -267,7 +271,7 @@ def test_scaled_forces_hold_the_shape_that_is_told(element: str, factor: float) 
     problem = bar((3, 2, 1), 10.0, element)
     equilibria = two_patches(problem)
     design = held_design(equilibria, mixed_density(problem), problem.X_temp)
-    scaled = with_scaled_forces(equilibria, design, maps(equilibria, design), factor)
+    scaled = scaled_forces(equilibria, design, factor)
     assert scaled is not None
     missing = scaled.median.forces - factor * design.median.forces
     assert np.linalg.norm(missing) < 1e-4 * np.linalg.norm(design.median.forces)
@@ -282,7 +286,7 @@ def test_scaled_forces_hold_the_shape_that_is_told(element: str, factor: float) 
 def test_a_hardly_stretched_bar_obeys_hooke() -> None:
     problem = bar((5, 2, 2), 0.0)
     equilibria, design = pushed(problem, 1e-4, 1e-8)
-    scaled = with_scaled_forces(equilibria, design, maps(equilibria, design), 1.5)
+    scaled = scaled_forces(equilibria, design, 1.5)
     assert scaled is not None
     rest = equilibria.patches.mean(problem.body.X)
     before, after = (equilibria.patches.mean(d.median.x) - rest for d in (design, scaled))
@@ -290,6 +294,23 @@ def test_a_hardly_stretched_bar_obeys_hooke() -> None:
     assert rms(equilibria, scaled) < 1e-8
 
 
+@pytest.mark.parametrize(("factor", "first"), [(1.01, 1.0), (100.0, 0.25)])
+def test_forces_that_move_points_far_are_changed_in_parts_at_once(
+    bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch, factor: float, first: float
+) -> None:
+    """first : the share of the change that is tried first"""
+    asked = list[np.ndarray]()
+
+    def none(_: Equilibria, __: object, ___: np.ndarray, ____: Median, wanted: np.ndarray) -> None:
+        asked.append(wanted)
+
+    monkeypatch.setattr(robustness, "_median_of_forces", none)
+    equilibria, design = bent
+    assert scaled_forces(equilibria, design, factor) is None
+    np.testing.assert_allclose(asked[0], (1 + first * (factor - 1)) * design.median.forces)
+    assert len(asked) == (2 if first == 1 else 1)
+
+
 def test_forces_that_nothing_can_balance_are_not_claimed() -> None:
     equilibria, design = pushed(bar((5, 2, 2), 0.0), -0.05)
-    assert with_scaled_forces(equilibria, design, maps(equilibria, design), 1e3) is None
+    assert scaled_forces(equilibria, design, 1e3) is None

@@ -9,13 +9,16 @@ import pytest
 from bent_bar import PROFILE, bent_bar
 from shapes.boxes import box
 
+from fab4d.design import reduced
+from fab4d.design.finish import carried_in
 from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import Search, at_rest, undecided_fraction
+from fab4d.design.reduced import ReducedSettings, Search, at_rest, undecided_fraction
+from fab4d.fabrication.labels import ambiguous_fraction
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
 from fab4d.stages import _bring_up, _coarse, solve
-from fab4d.stages._design import problem_of
+from fab4d.stages._design import Trace, problem_of
 from fab4d.stages._figures import limits_of
 from fab4d.stages._printed import Printed
 from fab4d.stages.monitor import SilentMonitor
@@ -170,6 +173,58 @@ def test_linear_elements_round_what_quadratic_ones_lose(
     assert len(found["relaxed"]["x"]) == len(bar["X"])
     assert solve.NOT_LINEAR not in found["solve_report"]["left_out"]
     assert found["solve_report"]["printed_rms_mm"] <= 1.5
+
+
+@pytest.fixture(scope="module")
+def relaxed_bar() -> tuple[dict[str, np.ndarray], Search, ReducedSettings]:
+    """A bar, its relaxed design in linear elements, and the settings of the search."""
+    bar, profile = bent_bar((9, 2, 2), 50.0), PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
+    problem = problem_of(bar, PROFILE["materials"], "linear")
+    settings = search_settings(problem, profile)
+    return bar, reduced.relaxed(problem, settings, lambda at: None), settings  # noqa: ARG005
+
+
+@pytest.mark.parametrize(("share", "searched"), [(1.01, False), (0.99, True)])
+def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_misses_the_tolerance(
+    relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings],
+    monkeypatch: pytest.MonkeyPatch,
+    share: float,
+    searched: bool,
+) -> None:
+    """share : the tolerance, in errors of the relaxed design of linear elements in quadratic ones"""
+    bar, found, settings = relaxed_bar
+    carried = carried_in(problem_of(bar, PROFILE["materials"], "quadratic"), found)
+    assert carried is not None
+    settings = replace(settings, weights=settings.weights.replace(error_scale=share * solve._rms(carried)))
+    asked: list[Problem] = []
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(solve, "far_off", lambda *_: False)
+    monkeypatch.setattr(solve, "rounded_from", lambda *_: None)
+    monkeypatch.setattr(solve, "_found_in", lambda problem, *_: asked.append(problem))
+    profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
+    solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
+    assert [problem.body.order for problem in asked] == [2] * searched
+
+
+@pytest.mark.parametrize(("tolerance", "reached"), [(1.0, True), (1e-6, False)])
+def test_a_search_in_quadratic_elements_ends_in_labels_or_where_the_relaxed_design_misses_the_tolerance(
+    relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings], tolerance: float, reached: bool
+) -> None:
+    bar, profile = relaxed_bar[0], PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=3)}
+    problem = problem_of(bar, PROFILE["materials"], "quadratic")
+    settings, trace = search_settings(problem, profile), trace_of(problem, bar)
+    found = solve._found_in(problem, settings, trace)
+    assert (found is not None) == reached
+    shown = [row["phase"] for row in trace.rows]
+    assert shown[:2] == ["start", "relax"]
+    assert ("round" in shown) == reached
+    if found is not None:
+        assert ambiguous_fraction(found.design.rho) < 1e-3
+        assert solve._rms(found) <= settings.weights.error_scale
+
+
+def trace_of(problem: Problem, mesh: dict[str, np.ndarray]) -> Trace:
+    return Trace(problem, mesh, SilentMonitor(), 1.0)
 
 
 @pytest.mark.parametrize(
