@@ -137,7 +137,10 @@ def _resumable(job: Job, stage: Stage, selection: Selection) -> Iterator[None]:
     """Turn Ctrl-C into an error that says how to go on."""
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        # Compiled code that Ctrl-C stops raises SystemError because of it.
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
         again = "the same command again without --force" if selection.forced else "the same command again"
         msg = f"stopped in {stage.name}; what was finished is kept in {job.workspace.root}: to go on, give {again}"
         raise InterruptedRunError(msg) from None

@@ -176,6 +176,17 @@ def test_ctrl_c_keeps_the_checkpoint_and_says_how_to_go_on(toy: ModuleType, tmp_
     assert run(toy.job(tmp_path)) == ["add", "tell"]
 
 
+@pytest.mark.parametrize(("cause", "told"), [(KeyboardInterrupt(), InterruptedRunError), (None, SystemError)])
+def test_ctrl_c_in_compiled_code_stops_a_run_too(
+    toy: ModuleType, tmp_path: Path, cause: BaseException | None, told: type[Exception]
+) -> None:
+    def compiled(*_args: Any) -> Any:
+        raise SystemError from cause
+
+    with pytest.raises(told):
+        run(toy.job(tmp_path, scale=compiled))
+
+
 def test_sigterm_stops_a_run_as_ctrl_c_does(toy: ModuleType, tmp_path: Path) -> None:
     def killed(*_args: Any) -> Any:
         os.kill(os.getpid(), signal.SIGTERM)
