@@ -54,6 +54,9 @@ FEW_STEPS = 3
 CLEARLY_WORSE = 1.1
 # What is predicted beyond this multiple of the error before is as likely a failure of the prediction.
 NOT_TRUE = 3.0
+# Squeezed surfaces count for less than in the search: what that kept from the limit of their stability, labels that are
+# 0 or 1 take up, and positions that made up for it would miss the temporary shape by more.
+LEAST_STRETCH, LAM_SQUEEZE = 0.5, 1000.0
 # Share of the way to labels that are hard to come to that a step may come down to.
 PATIENT_STEP = 1e-3
 # Of up to so many tets each counts, and where flips end is chance: they begin again from other labels there, as long
@@ -74,6 +77,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
+    weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
     settings = _flip_settings(inputs, profile, rounding, weights)
     begin = _printed_designs(equilibria, relaxed, rounded["smp"], weights, settings)
     polish = _polish(weights, settings, trace)

@@ -495,6 +495,9 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
         targets.append(settings.target_rms * equilibria.problem.length)
         assert settings.low_rms == pytest.approx(low * weights.error_scale)
         assert settings.tolerance == weights.error_scale
+        # Printed labels may squeeze tets more than the search lets them.
+        assert 0 < weights.least_stretch < _design.LEAST_STRETCH
+        assert 0 < weights.lam_squeeze < _design.LAM_SQUEEZE
         return design
 
     monkeypatch.setattr(refit, "polish_labels", spy)
