@@ -387,7 +387,7 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
         damping = min(step.damping, LARGEST_DAMPING)
         at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
         watch(at)
-    if left.size and undecided_fraction(at.design.rho) > LEFT_UNDECIDED:
+    if undecided_fraction(at.design.rho) > LEFT_UNDECIDED:
         return None
     design, done = toward_density(equilibria, at.design, np.round(at.design.rho), DECIDED_STEP)
     found = replace(at, design=design if done == 1.0 else at.design, phase=Phase.DONE)

@@ -294,6 +294,26 @@ def test_a_hardly_stretched_bar_obeys_hooke() -> None:
     assert rms(equilibria, scaled) < 1e-8
 
 
+def test_moved_points_lead_past_unstable_states_from_the_state_before_alone(
+    bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    equilibria, design = bent
+    moves, tries = np.full((equilibria.patches.count, 3), 1e-3), list[tuple[np.ndarray, bool]]()
+
+    def none(
+        _: Equilibria, __: np.ndarray, ___: np.ndarray, x: np.ndarray, *____: object, stay: bool, **_____: object
+    ) -> None:
+        tries.append((x, stay))
+
+    monkeypatch.setattr(robustness, "equilibrate", none)
+    response = response_of(equilibria, design)
+    assert with_moved_points(equilibria, design, maps(equilibria, design), response, moves) is None
+    (ahead, first), (before, second) = tries
+    assert (first, second) == (True, False)
+    np.testing.assert_array_equal(before, design.median.x)
+    assert np.abs(ahead - before).max() > 1e-4
+
+
 @pytest.mark.parametrize(("factor", "first"), [(1.01, 1.0), (100.0, 0.25)])
 def test_forces_that_move_points_far_are_changed_in_parts_at_once(
     bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch, factor: float, first: float
