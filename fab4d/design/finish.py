@@ -107,7 +107,7 @@ def rounded_from(
 
 def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
     """As `rounded_from`, from any state of a search in the elements of the result."""
-    settings = replace(settings, round_growth=ROUND_GROWTH)
+    settings = replace(settings, round_growth=ROUND_GROWTH, patient=how.astray)
     L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
@@ -119,7 +119,8 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
         gone_astray = before.phase is Phase.RELAX and at.phase is Phase.ROUND and not at.stay
         if not tried and (hard >= HARD_STEPS or gone_astray) and left <= how.few_left:
-            found, tried = decided_by_and_by(at, settings, partial(watch, Phase.ROUND.value)), True
+            start = replace(at, damping=LARGEST_DAMPING) if how.astray and gone_astray else at
+            found, tried = decided_by_and_by(start, settings, partial(watch, Phase.ROUND.value)), True
             if found is not None:
                 return found
         if held_back == MOST_HELD_BACK:

@@ -50,6 +50,8 @@ MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
 # step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
+# Past unstable states the shape of a fine mesh snaps over when many densities change at once.
+PATIENT_SHARE = 0.25
 # Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
 # clear the way for others, but not so many times in a row.
 DECIDED_STEP, MOST_BARRED = 0.1, 3
@@ -71,6 +73,7 @@ class ReducedSettings:
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
     centers : (n_points,) vertices at which points are held first; None spreads them over the body
+    patient : whether less is decided at a time, and along stable ways if there are any, once steps have gone astray
     """
 
     n_points: int
@@ -83,6 +86,7 @@ class ReducedSettings:
     round_growth: float = 1.6
     nearly: float = 1.5
     centers: IntArray | None = None
+    patient: bool = False
 
 
 class Phase(Enum):
@@ -375,15 +379,16 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     that are nearly 0 or 1 stay so where they cannot all be.
     """
     equilibria, weights = at.equilibria, _rounding_weights(at, settings).replace(lam_round=0.0)
-    L, barred = smoothness_matrix(equilibria.problem), 0
+    L, barred, patient = smoothness_matrix(equilibria.problem), 0, settings.patient and not at.stay
+    share, stay = (PATIENT_SHARE, True) if patient else (DECIDED_SHARE, at.stay)
     while (left := np.flatnonzero(_undecided(at.design.rho))).size and barred < MOST_BARRED:
-        count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
+        count = max(int(share * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
         sure, unsure = np.split(left[np.argsort(-np.abs(at.design.rho[left] - 0.5), kind="stable")], [count])
         rho, movable = at.design.rho.copy(), np.zeros(len(at.design.rho), bool)
         rho[sure], movable[unsure] = np.round(rho[sure]), True
-        design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP)
+        design, done = _toward(at, rho, patient)
         barred = 0 if done == 1.0 else barred + 1
-        step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=at.stay)
+        step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=stay)
         damping = min(step.damping, LARGEST_DAMPING)
         at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
         watch(at)
@@ -393,6 +398,14 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     found = replace(at, design=design if done == 1.0 else at.design, phase=Phase.DONE)
     watch(found)
     return found
+
+
+def _toward(at: Search, rho: FloatArray, stable_first: bool) -> tuple[Design, float]:
+    """As `toward_density`, from where stable ways end if these are tried first: they are quicker."""
+    design, done = at.design, 0.0
+    if stable_first:
+        design, done = toward_density(at.equilibria, design, rho, DECIDED_STEP, stay=True)
+    return (design, done) if done == 1.0 else toward_density(at.equilibria, design, rho, DECIDED_STEP)
 
 
 # -- refit

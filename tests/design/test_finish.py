@@ -243,8 +243,8 @@ def test_on_finer_meshes_steps_go_astray_once_those_that_stay_are_hard(
 def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
     found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, relaxing: int
 ) -> None:
-    """At once where relaxing has led astray."""
-    carried, shares = carried_in(quadratic, found), list[float]()
+    """At once where relaxing has led astray, with small steps at first."""
+    carried, shares, dampings = carried_in(quadratic, found), list[float](), list[float]()
     assert carried is not None
     real = finish.decided_by_and_by
 
@@ -252,11 +252,13 @@ def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
         assert at.phase is Phase.ROUND
         assert at.iteration == 0
         shares.append(undecided_fraction(at.design.rho))
+        dampings.append(at.damping)
         return real(at, settings, watch)
 
     monkeypatch.setattr(finish, "decided_by_and_by", watched)
     at = rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(FINER_MESH, relax_iterations=relaxing))
     assert len(shares) == 1
+    assert dampings == [LARGEST_DAMPING]
     assert OTHER_ELEMENTS.few_left < shares[0] <= FINER_MESH.few_left
     assert at is not None
     assert undecided_fraction(at.design.rho) == 0

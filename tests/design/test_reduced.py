@@ -380,7 +380,7 @@ def lost_at(call: int, monkeypatch: pytest.MonkeyPatch, last: int, share: float 
     """Makes calls of toward_density, from this one to the last, end at a share of the way; steps change nothing."""
     calls = itertools.count(1)
 
-    def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float) -> tuple[Design, float]:
+    def follow(_: Equilibria, design: Design, rho: np.ndarray, *__: float, **___: bool) -> tuple[Design, float]:
         done = share if call <= next(calls) <= last else 1.0
         return replace(design, rho=design.rho + done * (rho - design.rho)), done
 
@@ -413,6 +413,51 @@ def test_nothing_is_decided_by_and_by_where_the_way_ends_too_often(
         assert found is shown[-1]
         assert found.phase is Phase.DONE
         np.testing.assert_allclose(found.design.rho, np.round(last.design.rho))
+
+
+@pytest.mark.parametrize("patient", [True, False])
+@pytest.mark.parametrize("stay", [True, False])
+def test_once_steps_have_gone_astray_less_is_decided_at_a_time_with_patience(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, patient: bool, stay: bool
+) -> None:
+    """And the steps that follow do not go astray."""
+    last, stays = searched[-1], list[bool]()
+    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)), stay=stay)
+    lost_at(1, monkeypatch, last=0)
+
+    def step(*given: Any, stay: bool = True) -> gauss_newton.Step:
+        stays.append(stay)
+        return gauss_newton.Step(given[3], 0.0, 1.0, True)
+
+    monkeypatch.setattr(reduced, "gauss_newton_step", step)
+    shown: list[Search] = []
+    settings = replace(settings_for(truth.problem), patient=patient)
+    assert decided_by_and_by(undecided, settings, shown.append) is not None
+    careful = patient and not stay
+    assert undecided_fraction(shown[0].design.rho) == (0.75 if careful else 0.5)
+    assert set(stays) == {stay or careful}
+
+
+@pytest.mark.parametrize("stable_first", [True, False])
+@pytest.mark.parametrize("leads", [True, False])
+def test_stable_ways_are_tried_first(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, stable_first: bool, leads: bool
+) -> None:
+    """Other ways go on from where they end."""
+    before, rho, asked = searched[-1].design, np.ones(truth.problem.n_tets), list[tuple[Design, bool]]()
+    halfway = replace(before, rho=0.5 * (before.rho + rho))
+
+    def follow(_: Equilibria, design: Design, __: np.ndarray, ___: float, stay: bool = False) -> tuple[Design, float]:
+        asked.append((design, stay))
+        return (halfway, 0.5) if stay and not leads else (replace(design, rho=rho), 1.0)
+
+    monkeypatch.setattr(reduced, "toward_density", follow)
+    design, done = reduced._toward(searched[-1], rho, stable_first)
+    first = [(before, True)] if stable_first else []
+    others = [(halfway, False)] if stable_first else [(before, False)]
+    assert asked == first + ([] if stable_first and leads else others)
+    assert done == 1.0
+    assert (design.rho == 1).all()
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.05, True), (0.0, False)])
