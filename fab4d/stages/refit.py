@@ -38,7 +38,8 @@ MOST_FITS = 3
 # Labels are flipped until the error is at most this multiple of that of the relaxed design, and meets the tolerance if
 # that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
-# A round of flips takes minutes on more than MANY_TETS: there they end at this share of the tolerance, or after a few.
+# A round of flips takes minutes on more than MANY_TETS: there held positions are first fitted to where loading ends,
+# and flips end at this share of the tolerance, or after a few.
 # So they do where the relaxed design is out of reach of the tolerance, and in quadratic elements that are too many to
 # round in: there the first is the tolerance itself.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
@@ -80,7 +81,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
     settings = _flip_settings(inputs, profile, rounding, weights)
     begin = _printed_designs(equilibria, relaxed, rounded["smp"], weights, settings)
-    polish = _polish(weights, settings, trace)
+    flips_last = rounding.n_tets > MANY_TETS
+    polish = _polish(weights, replace(settings, rounds=0) if flips_last else settings, trace)
     design = _best_flipped(equilibria, begin, polish, settings, trace)
     fit = _Fit(equilibria, design)
     if equilibria.patches.count:
@@ -91,6 +93,8 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
             polish = _polish(weights, replace(settings, target_rms=weights.error_scale, rounds=FEW_ROUNDS), trace)
             equilibria, design = carried.equilibria, polish(carried.equilibria, carried.design)
         fit = _reachable_fit(equilibria, design, weights, radius, polish, trace)
+        if flips_last and _rms(fit.equilibria, fit.design) > settings.target_rms:
+            fit = _flipped_fit(fit, weights, radius, _polish(weights, settings, trace), trace)
     equilibria, smp = fit.equilibria, fit.design.rho > 0.5
     design = polished(equilibria, fit.design)
     trace.add("refit", Search(equilibria, design))
@@ -253,6 +257,10 @@ def _followed(
     return _Printed(design, refit(equilibria, design, weights, lambda at: None, iterations=FEW_STEPS))  # noqa: ARG005
 
 
+def _rms(equilibria: Equilibria, design: Design) -> float:
+    return shape_error(equilibria.problem, design.final.y).rms
+
+
 def _programmed(done: Programming, smp: FloatArray) -> Design:
     return Design(smp, done.median, done.final)
 
@@ -311,6 +319,15 @@ def _reachable_fit(
             design = polish(equilibria, design)
     nearest = min(ends, key=lambda each: each[0])[1] if ends else _Fit(equilibria, design)
     return replace(nearest, fits=fits, missed=missed)
+
+
+def _flipped_fit(fit: _Fit, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace) -> _Fit:
+    """A fit of labels with flips, or the one before where loading ends no nearer to the temporary shape."""
+    flipped = polish(fit.equilibria, fit.design)
+    if flipped is fit.design:
+        return fit
+    after = _reachable_fit(fit.equilibria, flipped, weights, radius, polish, trace)
+    return min(after, fit, key=lambda each: (each.loading is None, _rms(each.equilibria, each.design)))
 
 
 def _begun_again(

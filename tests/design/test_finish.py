@@ -253,6 +253,7 @@ def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
         assert at.iteration == 0
         shares.append(undecided_fraction(at.design.rho))
         dampings.append(at.damping)
+        assert settings.patient
         return real(at, settings, watch)
 
     monkeypatch.setattr(finish, "decided_by_and_by", watched)

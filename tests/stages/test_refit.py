@@ -26,7 +26,7 @@ from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages import _design, _element, refit, solve, threshold
-from fab4d.stages._design import objective_weights, patches_of, problem_of
+from fab4d.stages._design import Trace, objective_weights, patches_of, problem_of
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.threshold import labels_for
@@ -159,6 +159,55 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     monkeypatch.setattr(refit, "carried_over", lambda *_: None)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
         next(refit._printed_designs(*given))
+
+
+@pytest.mark.parametrize("most", [1, 1_000_000])
+@pytest.mark.parametrize("met", [True, False])
+def test_labels_of_many_tets_are_flipped_last(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, most: int, met: bool
+) -> None:
+    """Where held positions alone, fitted to where loading ends, miss the goal."""
+    done = list[str]()
+    flip_settings, load = refit._flip_settings, program
+
+    def flips(_: Equilibria, design: Design, __: ObjectiveWeights, settings: FlipSettings, ___: Any) -> Design:
+        done.extend(["flips"] * (settings.rounds > 0))
+        return design
+
+    def loaded(*given: Any) -> Programming:
+        done.append("loading")
+        return load(*given)
+
+    monkeypatch.setattr(refit, "MANY_TETS", most)
+    monkeypatch.setattr(refit, "polish_labels", flips)
+    monkeypatch.setattr(refit, "program", loaded)
+    target = np.inf if met else 0.0
+    monkeypatch.setattr(refit, "_flip_settings", lambda *given: replace(flip_settings(*given), target_rms=target))
+    refit.run(inputs, PROFILE | {"solver": SolverSettings(element="linear")}, SilentMonitor())
+    if most == 1:
+        assert done[:2] == (["loading"] if met else ["loading", "flips"])
+    else:
+        assert done[0] == "flips"
+
+
+@pytest.mark.parametrize(("rms", "whole", "kept"), [(0.5, True, True), (2.0, True, False), (0.5, False, False)])
+def test_flips_after_loading_are_kept_where_loading_ends_nearer(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, rms: float, whole: bool, kept: bool
+) -> None:
+    """And goes all the way."""
+    equilibria, weights, _ = fit_of(inputs)
+    problem = equilibria.problem
+    design = refit._carried(equilibria, inputs["relaxed"], inputs["rounded"]["smp"].astype(np.float64))
+    assert design is not None
+    loading = Programming(design.median, design.final, 1, 1.0, 1.0)
+    y = problem.X_temp + rms * (design.final.y - problem.X_temp)
+    flipped = replace(design, final=replace(design.final, y=y))
+    before = refit._Fit(equilibria, design, loading=loading)
+    after = refit._Fit(equilibria, flipped, loading=loading if whole else None)
+    monkeypatch.setattr(refit, "_reachable_fit", lambda *_: after)
+    trace = Trace(problem, inputs["mesh"], SilentMonitor(), 1.0)
+    assert refit._flipped_fit(before, weights, 0.1, lambda *_: flipped, trace) is (after if kept else before)
+    assert refit._flipped_fit(before, weights, 0.1, lambda *_: design, trace) is before
 
 
 def test_labels_that_are_hard_to_come_to_are_looked_for_patiently(
