@@ -28,12 +28,10 @@ from fab4d.mesh.tetmesh import FloatArray
 # share of the undecided tets: the equilibria turn unstable on its way.
 MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
-# and by, the surest first, if they are few: that takes fewer steps than to raise the price of all of them until the
-# last is 0 or 1, and leaves a smaller error. So they are at once where relaxing led past unstable states: rounding
+# and by, the surest first, up to this share of all: that takes fewer steps than to raise the price of all of them until
+# the last is 0 or 1, and leaves a smaller error. So they are at once where relaxing led past unstable states: rounding
 # would.
-HARD_STEPS = 2
-# Up to this share of undecided tets is decided by and by where the steps come to nothing.
-LAST_SHARE = 0.7
+HARD_STEPS, LAST_SHARE = 2, 0.7
 # It is rounded in half the steps of a search from the start.
 ROUND_GROWTH = 2.5
 
@@ -53,7 +51,7 @@ class Rounding:
 
 
 # The design is near already.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, few_left=0.1, astray=False)
+OTHER_ELEMENTS = Rounding(relax_iterations=3, few_left=LAST_SHARE, astray=False)
 # Where other elements have been searched themselves, steps are hard because of them.
 SEARCHED = Rounding(relax_iterations=0, few_left=1.0, astray=False)
 # Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
@@ -125,7 +123,7 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
                 return found
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, max(how.few_left, LAST_SHARE))
+    return decided(at, settings, how.few_left)
 
 
 def _is_hard(after: Search) -> bool:

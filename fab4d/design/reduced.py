@@ -50,8 +50,9 @@ MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
 # step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
-# Past unstable states the shape of a fine mesh snaps over when many densities change at once.
-PATIENT_SHARE = 0.25
+# Past unstable states the shape of a fine mesh snaps over when many densities change at once. Once it has, so that the
+# error is this many times larger, it is stable, and little is left to lose.
+PATIENT_SHARE, SNAPPED = 0.25, 1.05
 # Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
 # clear the way for others, but not so many times in a row.
 DECIDED_STEP, MOST_BARRED = 0.1, 3
@@ -380,14 +381,16 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     """
     equilibria, weights = at.equilibria, _rounding_weights(at, settings).replace(lam_round=0.0)
     L, barred, patient = smoothness_matrix(equilibria.problem), 0, settings.patient and not at.stay
-    share, stay = (PATIENT_SHARE, True) if patient else (DECIDED_SHARE, at.stay)
     while (left := np.flatnonzero(_undecided(at.design.rho))).size and barred < MOST_BARRED:
+        share = PATIENT_SHARE if patient else DECIDED_SHARE
         count = max(int(share * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
         sure, unsure = np.split(left[np.argsort(-np.abs(at.design.rho[left] - 0.5), kind="stable")], [count])
         rho, movable = at.design.rho.copy(), np.zeros(len(at.design.rho), bool)
         rho[sure], movable[unsure] = np.round(rho[sure]), True
         design, done = _toward(at, rho, patient)
         barred = 0 if done == 1.0 else barred + 1
+        patient = patient and not _has_snapped(equilibria.problem, at.design, design)
+        stay = at.stay or patient
         step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=stay)
         damping = min(step.damping, LARGEST_DAMPING)
         at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
@@ -398,6 +401,10 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     found = replace(at, design=design if done == 1.0 else at.design, phase=Phase.DONE)
     watch(found)
     return found
+
+
+def _has_snapped(problem: Problem, before: Design, after: Design) -> bool:
+    return shape_error(problem, after.final.y).rms > SNAPPED * shape_error(problem, before.final.y).rms
 
 
 def _toward(at: Search, rho: FloatArray, stable_first: bool) -> tuple[Design, float]:

@@ -120,10 +120,11 @@ def test_the_last_few_tets_are_decided_by_and_by_where_steps_are_hard(found: Sea
     shown: list[Search] = []
     carried = carried_in(quadratic, found)
     assert carried is not None
-    at = rounded_from(carried, settings_for(quadratic), lambda _, at: shown.append(at))
+    how = replace(OTHER_ELEMENTS, few_left=0.1)
+    at = rounded_from(carried, settings_for(quadratic), lambda _, at: shown.append(at), how)
     assert at is shown[-1]
     shares = [undecided_fraction(state.design.rho) for state in shown]
-    first = next(k for k, share in enumerate(shares) if share <= OTHER_ELEMENTS.few_left)
+    first = next(k for k, share in enumerate(shares) if share <= how.few_left)
     by_and_by = shares[first + 1 :]
     assert shares[first] > by_and_by[0]
     assert by_and_by == sorted(by_and_by, reverse=True)
@@ -168,11 +169,10 @@ def test_what_steps_leave_undecided_is_rounded_up_to_a_share(
     carried, settings = carried_in(quadratic, found), settings_for(quadratic)
     assert carried is not None
     shown: list[Search] = []
-    monkeypatch.setattr(finish, "LAST_SHARE", 0.05)
-    assert rounded_from(carried, settings, lambda _, at: shown.append(at)) is None
+    few, all_of_them = (replace(OTHER_ELEMENTS, few_left=share) for share in (0.05, 1.0))
+    assert rounded_from(carried, settings, lambda _, at: shown.append(at), few) is None
     assert undecided_fraction(shown[-1].design.rho) > 0.05
-    monkeypatch.setattr(finish, "LAST_SHARE", 1.0)
-    at = rounded_from(carried, settings, lambda *_: None)
+    at = rounded_from(carried, settings, lambda *_: None, all_of_them)
     assert at is not None
     assert undecided_fraction(at.design.rho) <= settings.undecided_fraction
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
@@ -260,6 +260,6 @@ def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
     at = rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(FINER_MESH, relax_iterations=relaxing))
     assert len(shares) == 1
     assert dampings == [LARGEST_DAMPING]
-    assert OTHER_ELEMENTS.few_left < shares[0] <= FINER_MESH.few_left
+    assert 0.1 < shares[0] <= FINER_MESH.few_left
     assert at is not None
     assert undecided_fraction(at.design.rho) == 0

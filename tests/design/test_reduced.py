@@ -438,6 +438,45 @@ def test_once_steps_have_gone_astray_less_is_decided_at_a_time_with_patience(
     assert set(stays) == {stay or careful}
 
 
+def with_error(problem: Problem, design: Design, factor: float) -> Design:
+    """The design with so many times the error."""
+    error = shape_error(problem, design.final.y)
+    y = design.final.y + (factor - 1) * error.e @ error.R
+    return replace(design, final=replace(design.final, y=y))
+
+
+@pytest.mark.parametrize("snaps", [True, False])
+def test_patience_ends_once_the_shape_has_snapped_over(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, snaps: bool
+) -> None:
+    """The step that follows may go astray, and more is decided at a time."""
+    last, stays = searched[-1], list[bool]()
+
+    def step(*given: Any, stay: bool = True) -> gauss_newton.Step:
+        stays.append(stay)
+        return gauss_newton.Step(given[3], 0.0, 1.0, True)
+
+    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)), stay=False)
+    lost_at(1, monkeypatch, last=0)
+    monkeypatch.setattr(reduced, "gauss_newton_step", step)
+    monkeypatch.setattr(reduced, "_has_snapped", lambda *_: snaps)
+    shown: list[Search] = []
+    decided_by_and_by(undecided, replace(settings_for(truth.problem), patient=True), shown.append)
+    first, second = (undecided_fraction(at.design.rho) for at in shown[:2])
+    assert first == 0.75
+    assert second / first == pytest.approx(0.5 if snaps else 0.75, abs=0.02)
+    assert set(stays) == {not snaps}
+
+
+@pytest.mark.parametrize(("growth", "snapped"), [(1.04, False), (1.06, True)])
+def test_what_counts_as_snapped_over(truth: Truth, searched: list[Search], growth: float, snapped: bool) -> None:
+    before, problem = searched[-1].design, truth.problem
+    error = shape_error(problem, before.final.y)
+    grown = with_error(problem, before, growth)
+    assert shape_error(problem, grown.final.y).rms == pytest.approx(growth * error.rms, rel=1e-3)
+    assert reduced._has_snapped(problem, before, grown) is snapped
+
+
 @pytest.mark.parametrize("stable_first", [True, False])
 @pytest.mark.parametrize("leads", [True, False])
 def test_stable_ways_are_tried_first(
