@@ -50,8 +50,9 @@ MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
 # step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
-# Past unstable states the shape of a fine mesh snaps over when many densities change at once. Once it has, so that the
-# error is this many times larger, it is stable, and little is left to lose.
+# Past unstable states the shape of a fine mesh snaps over when many densities change at once: patience keeps to smaller
+# shares and to stable ways. It ends where these lead no farther, or the shape has snapped over all the same, so that
+# the error is this many times larger.
 PATIENT_SHARE, SNAPPED = 0.25, 1.05
 # Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
 # clear the way for others, but not so many times in a row.
@@ -74,7 +75,7 @@ class ReducedSettings:
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
     centers : (n_points,) vertices at which points are held first; None spreads them over the body
-    patient : whether less is decided at a time, and along stable ways if there are any, once steps have gone astray
+    patient : whether less is decided at a time, and along stable ways as far as they lead, once steps have gone astray
     """
 
     n_points: int
@@ -387,9 +388,9 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
         sure, unsure = np.split(left[np.argsort(-np.abs(at.design.rho[left] - 0.5), kind="stable")], [count])
         rho, movable = at.design.rho.copy(), np.zeros(len(at.design.rho), bool)
         rho[sure], movable[unsure] = np.round(rho[sure]), True
-        design, done = _toward(at, rho, patient)
-        barred = 0 if done == 1.0 else barred + 1
-        patient = patient and not _has_snapped(equilibria.problem, at.design, design)
+        design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP, stay=patient)
+        barred = 0 if patient or done == 1.0 else barred + 1
+        patient = patient and done == 1.0 and not _has_snapped(equilibria.problem, at.design, design)
         stay = at.stay or patient
         step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=stay)
         damping = min(step.damping, LARGEST_DAMPING)
@@ -405,14 +406,6 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
 
 def _has_snapped(problem: Problem, before: Design, after: Design) -> bool:
     return shape_error(problem, after.final.y).rms > SNAPPED * shape_error(problem, before.final.y).rms
-
-
-def _toward(at: Search, rho: FloatArray, stable_first: bool) -> tuple[Design, float]:
-    """As `toward_density`, from where stable ways end if these are tried first: they are quicker."""
-    design, done = at.design, 0.0
-    if stable_first:
-        design, done = toward_density(at.equilibria, design, rho, DECIDED_STEP, stay=True)
-    return (design, done) if done == 1.0 else toward_density(at.equilibria, design, rho, DECIDED_STEP)
 
 
 # -- refit

@@ -445,27 +445,33 @@ def with_error(problem: Problem, design: Design, factor: float) -> Design:
     return replace(design, final=replace(design.final, y=y))
 
 
-@pytest.mark.parametrize("snaps", [True, False])
-def test_patience_ends_once_the_shape_has_snapped_over(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, snaps: bool
+@pytest.mark.parametrize(("snaps", "leads", "lasts"), [(False, True, True), (True, True, False), (False, False, False)])
+def test_patience_ends_once_the_shape_has_snapped_over_or_no_stable_way_leads_on(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, snaps: bool, leads: bool, lasts: bool
 ) -> None:
-    """The step that follows may go astray, and more is decided at a time."""
-    last, stays = searched[-1], list[bool]()
+    """The step that follows and other ways may go astray, and more is decided at a time."""
+    last, stays, ways = searched[-1], list[bool](), list[bool]()
+
+    def follow(_: Equilibria, design: Design, rho: np.ndarray, __: float, stay: bool = False) -> tuple[Design, float]:
+        ways.append(stay)
+        return (replace(design, rho=rho), 1.0) if leads or not stay else (design, 0.5)
 
     def step(*given: Any, stay: bool = True) -> gauss_newton.Step:
         stays.append(stay)
         return gauss_newton.Step(given[3], 0.0, 1.0, True)
 
     undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)), stay=False)
-    lost_at(1, monkeypatch, last=0)
+    monkeypatch.setattr(reduced, "toward_density", follow)
     monkeypatch.setattr(reduced, "gauss_newton_step", step)
     monkeypatch.setattr(reduced, "_has_snapped", lambda *_: snaps)
     shown: list[Search] = []
-    decided_by_and_by(undecided, replace(settings_for(truth.problem), patient=True), shown.append)
+    found = decided_by_and_by(undecided, replace(settings_for(truth.problem), patient=True), shown.append)
+    assert found is not None
     first, second = (undecided_fraction(at.design.rho) for at in shown[:2])
-    assert first == 0.75
-    assert second / first == pytest.approx(0.5 if snaps else 0.75, abs=0.02)
-    assert set(stays) == {not snaps}
+    assert first == (0.75 if leads else 1.0)
+    assert second / first == pytest.approx(0.75 if lasts else 0.5, abs=0.02)
+    assert set(stays) == {lasts}
+    assert ways[:2] == [True, lasts]
 
 
 @pytest.mark.parametrize(("growth", "snapped"), [(1.04, False), (1.06, True)])
@@ -475,28 +481,6 @@ def test_what_counts_as_snapped_over(truth: Truth, searched: list[Search], growt
     grown = with_error(problem, before, growth)
     assert shape_error(problem, grown.final.y).rms == pytest.approx(growth * error.rms, rel=1e-3)
     assert reduced._has_snapped(problem, before, grown) is snapped
-
-
-@pytest.mark.parametrize("stable_first", [True, False])
-@pytest.mark.parametrize("leads", [True, False])
-def test_stable_ways_are_tried_first(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, stable_first: bool, leads: bool
-) -> None:
-    """Other ways go on from where they end."""
-    before, rho, asked = searched[-1].design, np.ones(truth.problem.n_tets), list[tuple[Design, bool]]()
-    halfway = replace(before, rho=0.5 * (before.rho + rho))
-
-    def follow(_: Equilibria, design: Design, __: np.ndarray, ___: float, stay: bool = False) -> tuple[Design, float]:
-        asked.append((design, stay))
-        return (halfway, 0.5) if stay and not leads else (replace(design, rho=rho), 1.0)
-
-    monkeypatch.setattr(reduced, "toward_density", follow)
-    design, done = reduced._toward(searched[-1], rho, stable_first)
-    first = [(before, True)] if stable_first else []
-    others = [(halfway, False)] if stable_first else [(before, False)]
-    assert asked == first + ([] if stable_first and leads else others)
-    assert done == 1.0
-    assert (design.rho == 1).all()
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.05, True), (0.0, False)])
