@@ -390,8 +390,8 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
         rho[sure], movable[unsure] = np.round(rho[sure]), True
         design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP, stay=patient)
         barred = 0 if patient or done == 1.0 else barred + 1
-        patient = patient and done == 1.0 and not _has_snapped(equilibria.problem, at.design, design)
-        stay = at.stay or patient
+        stay = at.stay or (patient and not _has_snapped(equilibria.problem, at.design, design))
+        patient = patient and stay and done == 1.0
         step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=stay)
         damping = min(step.damping, LARGEST_DAMPING)
         at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
