@@ -41,21 +41,21 @@ class Rounding:
     """How a design that was carried over is relaxed further and rounded.
 
     relax_iterations : steps of relaxing at most
-    few_left : share of undecided tets that counts as few, where steps are hard
+    most_left : share of all tets, at most, that is decided by and by where steps are hard
     astray : whether steps past unstable states are taken, once those that stay are hard
     """
 
     relax_iterations: int
-    few_left: float
+    most_left: float
     astray: bool
 
 
 # The design is near already.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, few_left=LAST_SHARE, astray=False)
+OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE, astray=False)
 # Where other elements have been searched themselves, steps are hard because of them.
-SEARCHED = Rounding(relax_iterations=0, few_left=1.0, astray=False)
+SEARCHED = Rounding(relax_iterations=0, most_left=1.0, astray=False)
 # Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
-FINER_MESH = Rounding(relax_iterations=6, few_left=LAST_SHARE, astray=True)
+FINER_MESH = Rounding(relax_iterations=6, most_left=LAST_SHARE, astray=True)
 
 Watch = Callable[[str, Search], None]
 
@@ -116,14 +116,14 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
         gone_astray = before.phase is Phase.RELAX and at.phase is Phase.ROUND and not at.stay
-        if not tried and (hard >= HARD_STEPS or gone_astray) and left <= how.few_left:
+        if not tried and (hard >= HARD_STEPS or gone_astray) and left <= how.most_left:
             start = replace(at, damping=LARGEST_DAMPING) if how.astray and gone_astray else at
             found, tried = decided_by_and_by(start, settings, partial(watch, Phase.ROUND.value)), True
             if found is not None:
                 return found
         if held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, how.few_left)
+    return decided(at, settings, how.most_left)
 
 
 def _is_hard(after: Search) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,8 @@ MOST_FITS = 3
 # that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there held positions are first fitted to where loading ends,
-# and flips end at this share of the tolerance, or after a few.
-# So they do where the relaxed design is out of reach of the tolerance, and in quadratic elements that are too many to
-# round in: there the first is the tolerance itself.
+# and flips end at this share of the tolerance, or after a few. So they do where the relaxed design is out of reach of
+# the tolerance, and in quadratic elements that are too many to round in: there the first is the tolerance itself.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
 # At this share of the tolerance flips end with the first round that gains little; with more than MANY_DOFS unknowns,
 # where each round takes about a minute, at the tolerance.
@@ -133,20 +133,16 @@ def _best_flipped(
 
     Without points there are no held positions to follow flips, and the first is as good as any.
     """
-    problem, ends = equilibria.problem, list[Design]()
-
-    def rms_of(design: Design) -> float:
-        return shape_error(problem, design.final.y).rms
-
+    ends = list[Design]()
     for printed in begin:
         trace.add("printed", Search(equilibria, printed.design))
         trace.add("refit", Search(equilibria, printed.fitted))
         if not equilibria.patches.count:
             return printed.fitted
         ends.append(polish(equilibria, printed.fitted))
-        if rms_of(ends[-1]) <= settings.target_rms:
+        if _rms(equilibria, ends[-1]) <= settings.target_rms:
             break
-    return min(ends, key=rms_of)
+    return min(ends, key=partial(_rms, equilibria))
 
 
 def _printed_designs(
@@ -173,7 +169,7 @@ def _printed_designs(
     before, found = _relaxed_design(equilibria, relaxed), list[_Printed]()
 
     def rms_of(printed: _Printed) -> float:
-        return shape_error(problem, printed.fitted.final.y).rms
+        return _rms(equilibria, printed.fitted)
 
     ways = _ways(equilibria, before, smp, weights, settings)
     for followed in ways:
@@ -203,7 +199,7 @@ def _ways(
     was predicted of another that was followed, is left out if that can be true.
     """
     problem, few = equilibria.problem, equilibria.problem.n_tets <= FEW_TETS
-    most = NOT_TRUE * shape_error(problem, before.final.y).rms
+    most = NOT_TRUE * _rms(equilibria, before)
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
     best = promised = np.inf
     for labels in _repairs(problem, flips, rounded, smp, settings):
@@ -215,7 +211,7 @@ def _ways(
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
         if followed is not None:
-            best = min(best, shape_error(problem, followed.fitted.final.y).rms)
+            best = min(best, _rms(equilibria, followed.fitted))
             promised = min(promised, left)
         yield followed
 
@@ -305,12 +301,12 @@ def _reachable_fit(
     for fits in range(1, MOST_FITS + 1):
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         end = _programmed(done, design.rho)
-        rms = shape_error(equilibria.problem, end.final.y).rms
+        rms = _rms(equilibria, end)
         there, whole = same_shape(done, design.median.x), done.loaded == done.unloaded == 1.0
         if whole:
             ends.append((rms, _Fit(equilibria, end, loading=done)))
         if not there:
-            missed = min(missed, shape_error(equilibria.problem, design.final.y).rms)
+            missed = min(missed, _rms(equilibria, design))
             trace.add("reached", Search(equilibria, end))
         if there or (whole and rms <= weights.error_scale):
             break
@@ -327,14 +323,15 @@ def _flipped_fit(fit: _Fit, weights: ObjectiveWeights, radius: float, polish: Po
     if flipped is fit.design:
         return fit
     after = _reachable_fit(fit.equilibria, flipped, weights, radius, polish, trace)
-    return min(after, fit, key=lambda each: (each.loading is None, _rms(each.equilibria, each.design)))
+    best = min(after, fit, key=lambda each: (each.loading is None, _rms(each.equilibria, each.design)))
+    return replace(best, fits=fit.fits + after.fits, missed=min(fit.missed, after.missed))
 
 
 def _begun_again(
     equilibria: Equilibria, design: Design, end: Design, whole: bool, weights: ObjectiveWeights, radius: float
 ) -> tuple[Equilibria, Design]:
     """What the next fit begins with where loading ended elsewhere, after it went all the way or not."""
-    meets = shape_error(equilibria.problem, design.final.y).rms <= weights.error_scale
+    meets = _rms(equilibria, design) <= weights.error_scale
     if not whole or not meets:
         return equilibria, end
     weights = weights.of_fixed_density()
@@ -344,7 +341,7 @@ def _begun_again(
 
 def _not_reached(problem: Problem, fit: _Fit, weights: ObjectiveWeights) -> list[str]:
     """Why the design misses the tolerance where a fit meets it."""
-    rms = shape_error(problem, fit.design.final.y).rms
+    rms = _rms(fit.equilibria, fit.design)
     if fit.loading is None or rms <= weights.error_scale or fit.missed > weights.error_scale:
         return []
     return [

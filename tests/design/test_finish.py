@@ -120,11 +120,11 @@ def test_the_last_few_tets_are_decided_by_and_by_where_steps_are_hard(found: Sea
     shown: list[Search] = []
     carried = carried_in(quadratic, found)
     assert carried is not None
-    how = replace(OTHER_ELEMENTS, few_left=0.1)
+    how = replace(OTHER_ELEMENTS, most_left=0.1)
     at = rounded_from(carried, settings_for(quadratic), lambda _, at: shown.append(at), how)
     assert at is shown[-1]
     shares = [undecided_fraction(state.design.rho) for state in shown]
-    first = next(k for k, share in enumerate(shares) if share <= how.few_left)
+    first = next(k for k, share in enumerate(shares) if share <= how.most_left)
     by_and_by = shares[first + 1 :]
     assert shares[first] > by_and_by[0]
     assert by_and_by == sorted(by_and_by, reverse=True)
@@ -169,7 +169,7 @@ def test_what_steps_leave_undecided_is_rounded_up_to_a_share(
     carried, settings = carried_in(quadratic, found), settings_for(quadratic)
     assert carried is not None
     shown: list[Search] = []
-    few, all_of_them = (replace(OTHER_ELEMENTS, few_left=share) for share in (0.05, 1.0))
+    few, all_of_them = (replace(OTHER_ELEMENTS, most_left=share) for share in (0.05, 1.0))
     assert rounded_from(carried, settings, lambda _, at: shown.append(at), few) is None
     assert undecided_fraction(shown[-1].design.rho) > 0.05
     at = rounded_from(carried, settings, lambda *_: None, all_of_them)
@@ -232,7 +232,7 @@ def test_on_finer_meshes_steps_go_astray_once_those_that_stay_are_hard(
     monkeypatch.setattr(finish, "STEPS", {Phase.RELAX: step, Phase.ROUND: step})
     carried = carried_in(quadratic, found)
     assert carried is not None
-    rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(how, few_left=0.0))
+    rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(how, most_left=0.0))
     assert steps == made
     if how.astray:
         assert dampings[1] == dampings[0]
@@ -260,6 +260,6 @@ def test_on_finer_meshes_most_tets_are_decided_by_and_by_where_steps_are_hard(
     at = rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(FINER_MESH, relax_iterations=relaxing))
     assert len(shares) == 1
     assert dampings == [LARGEST_DAMPING]
-    assert 0.1 < shares[0] <= FINER_MESH.few_left
+    assert 0.1 < shares[0] <= FINER_MESH.most_left
     assert at is not None
     assert undecided_fraction(at.design.rho) == 0

@@ -454,6 +454,7 @@ def test_patience_ends_once_the_shape_has_snapped_over_or_no_stable_way_leads_on
 
     def follow(_: Equilibria, design: Design, rho: np.ndarray, __: float, stay: bool = False) -> tuple[Design, float]:
         ways.append(stay)
+        assert len(ways) < 100
         return (replace(design, rho=rho), 1.0) if leads or not stay else (design, 0.5)
 
     def step(*given: Any, stay: bool = True) -> gauss_newton.Step:

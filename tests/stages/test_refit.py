@@ -202,11 +202,13 @@ def test_flips_after_loading_are_kept_where_loading_ends_nearer(
     loading = Programming(design.median, design.final, 1, 1.0, 1.0)
     y = problem.X_temp + rms * (design.final.y - problem.X_temp)
     flipped = replace(design, final=replace(design.final, y=y))
-    before = refit._Fit(equilibria, design, loading=loading)
-    after = refit._Fit(equilibria, flipped, loading=loading if whole else None)
+    before = refit._Fit(equilibria, design, fits=2, loading=loading, missed=0.3)
+    after = refit._Fit(equilibria, flipped, fits=1, loading=loading if whole else None)
     monkeypatch.setattr(refit, "_reachable_fit", lambda *_: after)
     trace = Trace(problem, inputs["mesh"], SilentMonitor(), 1.0)
-    assert refit._flipped_fit(before, weights, 0.1, lambda *_: flipped, trace) is (after if kept else before)
+    found = refit._flipped_fit(before, weights, 0.1, lambda *_: flipped, trace)
+    assert found.design is (flipped if kept else design)
+    assert (found.fits, found.missed) == (3, 0.3)
     assert refit._flipped_fit(before, weights, 0.1, lambda *_: design, trace) is before
 
 
