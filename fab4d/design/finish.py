@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
-from fab4d.design.gauss_newton import FIRST_DAMPING, SEARCH_TOLERANCE, Design, equilibrate
-from fab4d.design.objective import smoothness_matrix
+from fab4d.design.gauss_newton import SEARCH_TOLERANCE, Design, equilibrate
+from fab4d.design.objective import ObjectiveWeights, smoothness_matrix
 from fab4d.design.patches import patches_from_faces
 from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import (
@@ -42,20 +42,23 @@ class Rounding:
 
     relax_iterations : steps of relaxing at most
     most_left : share of all tets, at most, that is decided by and by where steps are hard
-    astray : whether steps past unstable states are taken, once those that stay are hard
+    clear : whether the median shape keeps clear of unstable states, and tets are decided by and by once it is relaxed
     """
 
     relax_iterations: int
     most_left: float
-    astray: bool
+    clear: bool
 
 
 # The design is near already.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE, astray=False)
+OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE, clear=False)
 # Where other elements have been searched themselves, steps are hard because of them.
-SEARCHED = Rounding(relax_iterations=0, most_left=1.0, astray=False)
-# Squeezed surfaces turn unstable in waves that a coarser mesh does not show: most ways lead past unstable states there.
-FINER_MESH = Rounding(relax_iterations=6, most_left=LAST_SHARE, astray=True)
+SEARCHED = Rounding(relax_iterations=0, most_left=1.0, clear=False)
+# Squeezed surfaces turn unstable in waves that a coarser mesh does not show. At the edge of that no step leads on.
+FINER_MESH = Rounding(relax_iterations=10, most_left=LAST_SHARE, clear=True)
+# A median shape is clear of unstable states where each mode keeps this share of its stiffness. One that has lost it
+# counts as much as an error of the tolerance.
+LEAST_STABLE, LAM_STABLE = 0.2, 1.0
 
 Watch = Callable[[str, Search], None]
 
@@ -105,25 +108,28 @@ def rounded_from(
 
 def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
     """As `rounded_from`, from any state of a search in the elements of the result."""
-    settings = replace(settings, round_growth=ROUND_GROWTH, patient=how.astray)
+    weights = kept_clear(settings.weights) if how.clear else settings.weights
+    settings = replace(settings, weights=weights, round_growth=ROUND_GROWTH)
     L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
-        if how.astray and before.stay and _is_hard(at):
-            at = replace(at if at.accepted else before, stay=False, damping=FIRST_DAMPING, accepted=True)
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        gone_astray = before.phase is Phase.RELAX and at.phase is Phase.ROUND and not at.stay
-        if not tried and (hard >= HARD_STEPS or gone_astray) and left <= how.most_left:
-            start = replace(at, damping=LARGEST_DAMPING) if how.astray and gone_astray else at
-            found, tried = decided_by_and_by(start, settings, partial(watch, Phase.ROUND.value)), True
+        relaxed = how.clear and before.phase is Phase.RELAX and at.phase is Phase.ROUND
+        if not tried and (hard >= HARD_STEPS or relaxed) and left <= how.most_left:
+            found, tried = decided_by_and_by(at, settings, partial(watch, Phase.ROUND.value)), True
             if found is not None:
                 return found
         if held_back == MOST_HELD_BACK:
             break
     return decided(at, settings, how.most_left)
+
+
+def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:
+    """The objective that also keeps the median shape clear of unstable states."""
+    return weights.replace(least_stable=LEAST_STABLE, lam_stable=LAM_STABLE)
 
 
 def _is_hard(after: Search) -> bool:

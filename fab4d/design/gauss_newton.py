@@ -23,6 +23,7 @@ from fab4d.design.objective import (
     stretch_excess,
 )
 from fab4d.design.sensitivity import Change, Linearisation, linearise
+from fab4d.design.stability import softening, softening_penalty
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.solvers.threads import first_found
 
@@ -125,7 +126,7 @@ class Model:
     gradient_rho (m,), gradient_c (3K,) : gradient of the objective
     dy_dc (3N, 3K), df_dc (3K, 3K) : derivatives of final shape and forces with respect to the held positions
     dx_dc (3N, 3K) : derivative of the median shape with respect to the held positions
-    force_rows (k, 3K), shape_rows (k, 3N) : derivatives of the active limits of forces and stretches
+    force_rows (k, 3K), shape_rows (k, 3N) : derivatives of the active limits of forces, stretches and soft modes
     H_cc (3K, 3K) : Gauss-Newton Hessian of the held positions
     """
 
@@ -214,8 +215,9 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
     beyond = forces_beyond(weights, equilibria.patches, design.median)
     stretch = stretch_excess(problem, weights, design.rho, design.median.x)
     squeezed = squeeze(problem, weights, design.median.x)
-    shape_rows = vstack([stretch.rows, squeezed.rows], format="csr")
-    shape_values = np.concatenate([stretch.values, squeezed.values])
+    soft = softening(equilibria, weights, design.rho, design.median, lin.held)
+    shape_rows = vstack([stretch.rows, squeezed.rows, soft.rows], format="csr")
+    shape_values = np.concatenate([stretch.values, squeezed.values, soft.values])
     gx, gf = (shape_rows.T @ shape_values).reshape(-1, 3), (beyond.rows.T @ beyond.values).reshape(-1, 3)
     g_rho, g_c = lin.adjoint(gx, gf, gy)
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
@@ -227,7 +229,7 @@ def build_model(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array,
     return Model(
         lin=lin,
         metric=metric,
-        gradient_rho=g_rho + terms.gradient + stretch.density_gradient(problem.n_tets),
+        gradient_rho=g_rho + terms.gradient + stretch.density_gradient(problem.n_tets) + soft.density_gradient(),
         gradient_c=g_c.ravel(),
         dx_dc=dx_dc,
         df_dc=df_dc,
@@ -321,7 +323,8 @@ def evaluate(equilibria: Equilibria, weights: ObjectiveWeights, L: csr_array, de
     """The objective at a design."""
     problem = equilibria.problem
     terms = density_terms(weights, problem.volume_fractions, L, design.rho)
-    return objective_value(equilibria, weights, terms, design.rho, design.median, design.final)
+    value = objective_value(equilibria, weights, terms, design.rho, design.median, design.final)
+    return value + softening_penalty(equilibria, weights, design.rho, design.median)
 
 
 def _density_step(damped: DampedModel, rho: FloatArray, movable: BoolArray | None, n_cg: int = 30) -> FloatArray:

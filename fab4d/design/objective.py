@@ -25,6 +25,9 @@ class ObjectiveWeights:
 
     least_stretch : smallest principal stretch below which tets count as squeezed
     lam_squeeze : weight of the mean square, over the volume, of what the stretches of squeezed tets lack of it
+
+    least_stable : share of its stiffness that a mode of the median shape keeps at least, below which it counts as soft
+    lam_stable : weight of the sum of squares of what soft modes lack of it, relative to it
     """
 
     error_scale: float
@@ -39,6 +42,8 @@ class ObjectiveWeights:
     limit: float = 100.0
     least_stretch: float = 0.0
     lam_squeeze: float = 0.0
+    least_stable: float = 0.0
+    lam_stable: float = 0.0
 
     def replace(self, **changes: float) -> "ObjectiveWeights":
         """The same with other numbers."""
@@ -291,7 +296,7 @@ def objective_value(
     median: Median,
     final: Final,
 ) -> float:
-    """The whole objective, each term dimensionless."""
+    """The objective but for soft modes, each term dimensionless."""
     problem = equilibria.problem
     error = shape_error(problem, final.y).rms / weights.error_scale
     forces = 0.5 * float((forces_beyond(weights, equilibria.patches, median).values ** 2).sum())

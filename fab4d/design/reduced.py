@@ -50,10 +50,6 @@ MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
 # step that follows.
 DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
-# Past unstable states the shape of a fine mesh snaps over when many densities change at once: patience keeps to smaller
-# shares and to stable ways. It ends where these lead no farther, or the shape has snapped over all the same, so that
-# the error is this many times larger.
-PATIENT_SHARE, SNAPPED = 0.25, 1.05
 # Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
 # clear the way for others, but not so many times in a row.
 DECIDED_STEP, MOST_BARRED = 0.1, 3
@@ -75,7 +71,6 @@ class ReducedSettings:
 
     nearly : where the tolerance is missed by up to this factor, relaxing goes on with steps past unstable states
     centers : (n_points,) vertices at which points are held first; None spreads them over the body
-    patient : whether less is decided at a time, and along stable ways as far as they lead, once steps have gone astray
     """
 
     n_points: int
@@ -88,7 +83,6 @@ class ReducedSettings:
     round_growth: float = 1.6
     nearly: float = 1.5
     centers: IntArray | None = None
-    patient: bool = False
 
 
 class Phase(Enum):
@@ -381,18 +375,15 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     that are nearly 0 or 1 stay so where they cannot all be.
     """
     equilibria, weights = at.equilibria, _rounding_weights(at, settings).replace(lam_round=0.0)
-    L, barred, patient = smoothness_matrix(equilibria.problem), 0, settings.patient and not at.stay
+    L, barred, clear = smoothness_matrix(equilibria.problem), 0, weights.lam_stable > 0
     while (left := np.flatnonzero(_undecided(at.design.rho))).size and barred < MOST_BARRED:
-        share = PATIENT_SHARE if patient else DECIDED_SHARE
-        count = max(int(share * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
+        count = max(int(DECIDED_SHARE * len(left)), FEWEST_DECIDED, int(LEAST_SHARE * equilibria.problem.n_tets))
         sure, unsure = np.split(left[np.argsort(-np.abs(at.design.rho[left] - 0.5), kind="stable")], [count])
         rho, movable = at.design.rho.copy(), np.zeros(len(at.design.rho), bool)
         rho[sure], movable[unsure] = np.round(rho[sure]), True
-        design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP, stay=patient)
-        barred = 0 if patient or done == 1.0 else barred + 1
-        stay = at.stay or (patient and not _has_snapped(equilibria.problem, at.design, design))
-        patient = patient and stay and done == 1.0
-        step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=stay)
+        design, done = toward_density(equilibria, at.design, rho, DECIDED_STEP, stay=clear)
+        barred = 0 if done == 1.0 else barred + 1
+        step = gauss_newton_step(equilibria, weights, L, design, at.damping, movable, DECIDED_TRIES, stay=at.stay)
         damping = min(step.damping, LARGEST_DAMPING)
         at = replace(at, design=step.design, damping=damping, iteration=at.iteration + 1, accepted=True)
         watch(at)
@@ -402,10 +393,6 @@ def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lamb
     found = replace(at, design=design if done == 1.0 else at.design, phase=Phase.DONE)
     watch(found)
     return found
-
-
-def _has_snapped(problem: Problem, before: Design, after: Design) -> bool:
-    return shape_error(problem, after.final.y).rms > SNAPPED * shape_error(problem, before.final.y).rms
 
 
 # -- refit

@@ -22,6 +22,13 @@ def _element_forces(equilibria: Equilibria, gradients: FloatArray, moduli: Modul
     return out
 
 
+def forces_by_density(equilibria: Equilibria, x: FloatArray) -> FloatArray:
+    """(m, nn, 3) derivative of each element's nodal forces in the hot shape x (N, 3) with respect to its density."""
+    problem = equilibria.problem
+    hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
+    return _element_forces(equilibria, problem.body.dN, hot, x - problem.body.X)
+
+
 def element_dofs(elements: IntArray) -> IntArray:
     """(m, 3nn) dofs of the nodes of elements (m, nn)."""
     return (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), -1)
@@ -169,9 +176,8 @@ def linearise(equilibria: Equilibria, rho: FloatArray, median: Median, final: Fi
         3 * problem.n_nodes,
     )
     body = problem.body
-    hot = Moduli(problem.rubbery.mu - problem.tpe.mu, problem.rubbery.kappa - problem.tpe.kappa)
     cold = _element_forces(equilibria, median.gradients, problem.glassy, final.y - median.x)
-    by_hot = _element_forces(equilibria, body.dN, hot, median.x - body.X)
+    by_hot = forces_by_density(equilibria, median.x)
     by_cold = cold - _element_forces(equilibria, body.dN, problem.tpe, final.y - body.X)
     R_x, R_y = (force_columns(body.elements, forces, problem.n_nodes) for forces in (by_hot, by_cold))
     return Linearisation(

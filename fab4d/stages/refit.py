@@ -9,7 +9,7 @@ import numpy as np
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.exchange import held_apart
-from fab4d.design.finish import carried_in, carried_over
+from fab4d.design.finish import carried_in, carried_over, kept_clear
 from fab4d.design.flips import FlipSettings, compensated, error_left, mended, predicted
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design, build_model
@@ -79,9 +79,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
     weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
+    flips_last = rounding.n_tets > MANY_TETS
+    if flips_last:
+        weights = kept_clear(weights)
     settings = _flip_settings(inputs, profile, rounding, weights)
     begin = _printed_designs(equilibria, relaxed, rounded["smp"], weights, settings)
-    flips_last = rounding.n_tets > MANY_TETS
     polish = _polish(weights, replace(settings, rounds=0) if flips_last else settings, trace)
     design = _best_flipped(equilibria, begin, polish, settings, trace)
     fit = _Fit(equilibria, design)

@@ -415,73 +415,23 @@ def test_nothing_is_decided_by_and_by_where_the_way_ends_too_often(
         np.testing.assert_allclose(found.design.rho, np.round(last.design.rho))
 
 
-@pytest.mark.parametrize("patient", [True, False])
-@pytest.mark.parametrize("stay", [True, False])
-def test_once_steps_have_gone_astray_less_is_decided_at_a_time_with_patience(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, patient: bool, stay: bool
+@pytest.mark.parametrize("lam_stable", [0.0, 1.0])
+def test_ways_to_decided_densities_stay_on_stable_states_where_the_median_shape_keeps_clear_of_others(
+    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, lam_stable: float
 ) -> None:
-    """And the steps that follow do not go astray."""
     last, stays = searched[-1], list[bool]()
-    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)), stay=stay)
-    lost_at(1, monkeypatch, last=0)
+    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)))
+    real = reduced.toward_density
 
-    def step(*given: Any, stay: bool = True) -> gauss_newton.Step:
+    def watched(*given: Any, stay: bool = False) -> tuple[Design, float]:
         stays.append(stay)
-        return gauss_newton.Step(given[3], 0.0, 1.0, True)
+        return real(*given, stay=stay)
 
-    monkeypatch.setattr(reduced, "gauss_newton_step", step)
-    shown: list[Search] = []
-    settings = replace(settings_for(truth.problem), patient=patient)
-    assert decided_by_and_by(undecided, settings, shown.append) is not None
-    careful = patient and not stay
-    assert undecided_fraction(shown[0].design.rho) == (0.75 if careful else 0.5)
-    assert set(stays) == {stay or careful}
-
-
-def with_error(problem: Problem, design: Design, factor: float) -> Design:
-    """The design with so many times the error."""
-    error = shape_error(problem, design.final.y)
-    y = design.final.y + (factor - 1) * error.e @ error.R
-    return replace(design, final=replace(design.final, y=y))
-
-
-@pytest.mark.parametrize(("snaps", "leads", "lasts"), [(False, True, True), (True, True, False), (False, False, False)])
-def test_patience_ends_once_the_shape_has_snapped_over_or_no_stable_way_leads_on(
-    truth: Truth, searched: list[Search], monkeypatch: pytest.MonkeyPatch, snaps: bool, leads: bool, lasts: bool
-) -> None:
-    """Other ways may go astray, and more is decided at a time; steps too, at once after it has snapped over."""
-    last, stays, ways = searched[-1], list[bool](), list[bool]()
-
-    def follow(_: Equilibria, design: Design, rho: np.ndarray, __: float, stay: bool = False) -> tuple[Design, float]:
-        ways.append(stay)
-        assert len(ways) < 100
-        return (replace(design, rho=rho), 1.0) if leads or not stay else (design, 0.5)
-
-    def step(*given: Any, stay: bool = True) -> gauss_newton.Step:
-        stays.append(stay)
-        return gauss_newton.Step(given[3], 0.0, 1.0, True)
-
-    undecided = replace(last, design=replace(last.design, rho=np.abs(np.round(last.design.rho) - 0.3)), stay=False)
-    monkeypatch.setattr(reduced, "toward_density", follow)
-    monkeypatch.setattr(reduced, "gauss_newton_step", step)
-    monkeypatch.setattr(reduced, "_has_snapped", lambda *_: snaps)
-    shown: list[Search] = []
-    found = decided_by_and_by(undecided, replace(settings_for(truth.problem), patient=True), shown.append)
-    assert found is not None
-    first, second = (undecided_fraction(at.design.rho) for at in shown[:2])
-    assert first == (0.75 if leads else 1.0)
-    assert second / first == pytest.approx(0.75 if lasts else 0.5, abs=0.02)
-    assert stays[:2] == [not snaps, lasts]
-    assert ways[:2] == [True, lasts]
-
-
-@pytest.mark.parametrize(("growth", "snapped"), [(1.04, False), (1.06, True)])
-def test_what_counts_as_snapped_over(truth: Truth, searched: list[Search], growth: float, snapped: bool) -> None:
-    before, problem = searched[-1].design, truth.problem
-    error = shape_error(problem, before.final.y)
-    grown = with_error(problem, before, growth)
-    assert shape_error(problem, grown.final.y).rms == pytest.approx(growth * error.rms, rel=1e-3)
-    assert reduced._has_snapped(problem, before, grown) is snapped
+    monkeypatch.setattr(reduced, "toward_density", watched)
+    weights = settings_for(truth.problem).weights.replace(lam_stable=lam_stable, least_stable=0.1)
+    assert decided_by_and_by(undecided, settings_for(truth.problem, weights=weights)) is not None
+    assert len(stays) > 2
+    assert set(stays[:-1]) == {lam_stable > 0}
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.05, True), (0.0, False)])

@@ -13,7 +13,7 @@ import pytest
 from bent_bar import PROFILE as BENT_BAR
 from bent_bar import bent_bar
 
-from fab4d.design import reduced
+from fab4d.design import finish, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.flips import FlipSettings, at_interface
 from fab4d.design.forward import Programming, balance, program, same_shape
@@ -166,11 +166,12 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
 def test_labels_of_many_tets_are_flipped_last(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, most: int, met: bool
 ) -> None:
-    """Where held positions alone, fitted to where loading ends, miss the goal."""
-    done = list[str]()
+    """Where held positions alone, fitted to where loading ends, miss the goal; all of it clear of unstable states."""
+    done, prices = list[str](), set[float]()
     flip_settings, load = refit._flip_settings, program
 
-    def flips(_: Equilibria, design: Design, __: ObjectiveWeights, settings: FlipSettings, ___: Any) -> Design:
+    def flips(_: Equilibria, design: Design, weights: ObjectiveWeights, settings: FlipSettings, __: Any) -> Design:
+        prices.add(weights.lam_stable)
         done.extend(["flips"] * (settings.rounds > 0))
         return design
 
@@ -188,6 +189,7 @@ def test_labels_of_many_tets_are_flipped_last(
         assert done[:2] == (["loading"] if met else ["loading", "flips"])
     else:
         assert done[0] == "flips"
+    assert prices == {finish.LAM_STABLE if most == 1 else 0.0}
 
 
 @pytest.mark.parametrize(("rms", "whole", "kept"), [(0.5, True, True), (2.0, True, False), (0.5, False, False)])

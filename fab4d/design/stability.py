@@ -1,0 +1,165 @@
+"""How near the held, hot median shape is to a state in which it would buckle, and what that depends on.
+
+Of a mode phi of the median shape, the ratio lambda of K phi = lambda K+ phi tells what is left of its stiffness: K is
+the tangent, K+ that of which each element's negative curvature is cut off. It is 1 where compression takes nothing, and
+0 where the shape turns unstable. Unlike a frequency it does not depend on the size of what moves: a slender limb that
+bends easily has a ratio near 1, and a wave on a squeezed surface about to fold one near 0.
+"""
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median
+from fab4d.design.objective import ObjectiveWeights
+from fab4d.design.sensitivity import forces_by_density
+from fab4d.mesh.tetmesh import FloatArray
+from fab4d.solvers.linear import Factor, SingularMatrixError
+
+# So many modes are looked at, those nearest to instability.
+MODES = 6
+MODE_TOLERANCE, MOST_RESTARTS = 1e-2, 50
+# Third derivatives are differences over a displacement that changes the edges of no tet by more than this share.
+DIFFERENCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class SoftModes:
+    """The modes nearest to instability: ratios (k,) rising, shapes (k, N, 3) with phi . K+ phi = 1."""
+
+    ratios: FloatArray
+    shapes: FloatArray
+
+
+# A median shape is in equilibrium with one density at one set of points, so that its modes are its own.
+_known: WeakKeyDictionary[Median, SoftModes] = WeakKeyDictionary()
+
+
+def soft_modes(equilibria: Equilibria, rho: FloatArray, median: Median, factor: Factor | None = None) -> SoftModes:
+    """Those of the median shape of rho (m,), by Lanczos on the inverse of the tangent.
+
+    factor : of `Equilibria.median_tangent` there, if it is known
+    Raises SingularMatrixError where the tangent is singular.
+    """
+    if median not in _known:
+        _known[median] = _found(equilibria, rho, median.x, factor)
+    return _known[median]
+
+
+def _found(equilibria: Equilibria, rho: FloatArray, x: FloatArray, factor: Factor | None) -> SoftModes:
+    n, pattern, W = x.size, equilibria.held_pattern, equilibria.operator
+    if factor is None:
+        factor = equilibria.held_analysis.factor(equilibria.median_tangent(rho, x))
+    moves = np.ones(n, bool)
+    moves[equilibria.held_mask.fixed] = False
+    count = min(MODES, int(moves.sum()) - 1)
+    if count < 1:
+        return SoftModes(np.zeros(0), np.zeros((0, *x.shape)))
+    data, size = equilibria.median_tangent(rho, x, spd=True), pattern.n_dofs
+    lower = csc_array((data, pattern.indices, pattern.indptr), shape=(size, size))[:n, :n]
+    diagonal = lower.diagonal()
+
+    def stiffness(u: FloatArray) -> FloatArray:
+        u = np.where(moves, u.ravel(), 0.0)
+        rig = W.T @ (W @ u.reshape(x.shape)) / RIG_COMPLIANCE
+        return np.where(moves, lower @ u + lower.T @ u - diagonal * u + rig.ravel(), 0.0)
+
+    def compliance(load: FloatArray) -> FloatArray:
+        bordered = np.zeros(size)
+        bordered[:n] = np.where(moves, load.ravel(), 0.0)
+        return np.where(moves, factor.solve(bordered)[:n], 0.0)
+
+    positive, inverse = (LinearOperator((n, n), matvec=each, dtype=np.float64) for each in (stiffness, compliance))
+    start = compliance(np.random.default_rng(0).standard_normal(n))
+    unstable = min(max(factor.n_negative - 3 * equilibria.patches.count, 0), count)
+    found = [
+        _lanczos(positive, inverse, start, *each) for each in ((unstable, "SA"), (count - unstable, "LA")) if each[0]
+    ]
+    ratios, shapes = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+    order = np.argsort(ratios)
+    return SoftModes(ratios[order], shapes.T[order].reshape(-1, *x.shape))
+
+
+def _lanczos(
+    positive: LinearOperator, inverse: LinearOperator, start: FloatArray, count: int, which: str
+) -> tuple[FloatArray, FloatArray]:
+    """Ratios (k,) and shapes (n, k), by `which` end of the inverse's spectrum; those found if not all are."""
+    try:
+        # Inverted about 0 only the inverse is used, so that the first operator need not be K.
+        return eigsh(
+            positive, count, M=positive, sigma=0.0, which=which, OPinv=inverse, v0=start,
+            tol=MODE_TOLERANCE, maxiter=MOST_RESTARTS,
+        )  # fmt: skip
+    except ArpackNoConvergence as error:
+        return error.eigenvalues, error.eigenvectors
+
+
+@dataclass(frozen=True, eq=False)
+class Softening:
+    """The modes (k,) of the median shape that are nearer to instability than they may be.
+
+    values (k,) : what the ratio lacks of the least one, relative to it, times the root of 2 lam_stable; half of their
+    squares sum to the penalty
+    rows (k, 3N), by_density (k, m) : their derivatives with respect to x and to the density, modes and K+ held: what
+    K+ changes counts as many times less as the ratio is below 1
+    """
+
+    values: FloatArray
+    rows: csr_array
+    by_density: FloatArray
+
+    def density_gradient(self) -> FloatArray:
+        """(m,) gradient of the penalty with respect to the density at a held median shape."""
+        return self.by_density.T @ self.values
+
+
+def softening(
+    equilibria: Equilibria, weights: ObjectiveWeights, rho: FloatArray, median: Median, factor: Factor | None = None
+) -> Softening:
+    """The penalty on modes of the median shape whose ratio is below weights.least_stable; see `soft_modes`."""
+    if weights.lam_stable == 0:
+        return Softening(np.zeros(0), csr_array((0, median.x.size)), np.zeros((0, len(rho))))
+    modes = soft_modes(equilibria, rho, median, factor)
+    soft = modes.ratios < weights.least_stable
+    slope = -np.sqrt(2 * weights.lam_stable) / weights.least_stable
+    rows = [slope * _by_shape(equilibria, rho, median.x, shape).ravel() for shape in modes.shapes[soft]]
+    by_density = [slope * _by_density(equilibria, median.x, shape) for shape in modes.shapes[soft]]
+    return Softening(
+        slope * (modes.ratios[soft] - weights.least_stable),
+        csr_array(np.reshape(rows, (len(rows), median.x.size))),
+        np.reshape(by_density, (len(rows), len(rho))),
+    )
+
+
+def softening_penalty(equilibria: Equilibria, weights: ObjectiveWeights, rho: FloatArray, median: Median) -> float:
+    """The same penalty without its derivatives; inf where the tangent is singular."""
+    if weights.lam_stable == 0:
+        return 0.0
+    try:
+        lacking = 1 - soft_modes(equilibria, rho, median).ratios / weights.least_stable
+    except SingularMatrixError:
+        return np.inf
+    return weights.lam_stable * float((np.maximum(lacking, 0.0) ** 2).sum())
+
+
+def _by_shape(equilibria: Equilibria, rho: FloatArray, x: FloatArray, shape: FloatArray) -> FloatArray:
+    """(N, 3) derivative of phi . K phi with respect to x: the second derivative of the nodal forces along phi."""
+    h = _short(equilibria, x, shape)
+    before, at, after = (equilibria.median_gradient(rho, x + t * shape)[0] for t in (-h, 0.0, h))
+    return (before - 2 * at + after) / h**2
+
+
+def _by_density(equilibria: Equilibria, x: FloatArray, shape: FloatArray) -> FloatArray:
+    """(m,) derivative of phi . K phi with respect to the density."""
+    h = _short(equilibria, x, shape)
+    before, after = (forces_by_density(equilibria, x + t * shape) for t in (-h, h))
+    return np.einsum("mai,mai->m", after - before, shape[equilibria.problem.body.elements]) / (2 * h)
+
+
+def _short(equilibria: Equilibria, x: FloatArray, shape: FloatArray) -> float:
+    corners = equilibria.problem.body.elements[:, :4]
+    edges, changes = (np.linalg.norm(each[corners[:, 1:]] - each[corners[:, :1]], axis=2) for each in (x, shape))
+    return DIFFERENCE / float((changes / edges).max())
