@@ -22,6 +22,7 @@ from fab4d.design.reduced import (
     decided_by_and_by,
     undecided_fraction,
 )
+from fab4d.design.stability import soft_modes
 from fab4d.mesh.tetmesh import FloatArray
 
 # So many steps in a row end the rounding that are not taken, or only with the largest damping and leave more than this
@@ -29,8 +30,8 @@ from fab4d.mesh.tetmesh import FloatArray
 MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
 # and by, the surest first, up to this share of all: that takes fewer steps than to raise the price of all of them until
-# the last is 0 or 1, and leaves a smaller error. So they are at once where relaxing led past unstable states: rounding
-# would.
+# the last is 0 or 1, and leaves a smaller error. So they are at once where the median shape is kept clear of unstable
+# states.
 HARD_STEPS, LAST_SHARE = 2, 0.7
 # It is rounded in half the steps of a search from the start.
 ROUND_GROWTH = 2.5
@@ -41,23 +42,22 @@ class Rounding:
     """How a design that was carried over is relaxed further and rounded.
 
     relax_iterations : steps of relaxing at most
-    most_left : share of all tets, at most, that is decided by and by where steps are hard
-    clear : whether the median shape keeps clear of unstable states, and tets are decided by and by once it is relaxed
+    most_left : share of all tets, at most, that is decided by and by
     """
 
     relax_iterations: int
     most_left: float
-    clear: bool
 
 
 # The design is near already.
-OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE, clear=False)
+OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE)
 # Where other elements have been searched themselves, steps are hard because of them.
-SEARCHED = Rounding(relax_iterations=0, most_left=1.0, clear=False)
-# Squeezed surfaces turn unstable in waves that a coarser mesh does not show. At the edge of that no step leads on.
-FINER_MESH = Rounding(relax_iterations=10, most_left=LAST_SHARE, clear=True)
+SEARCHED = Rounding(relax_iterations=0, most_left=1.0)
+# It is farther from that, and a step takes long.
+FINER_MESH = Rounding(relax_iterations=8, most_left=LAST_SHARE)
 # A median shape is clear of unstable states where each mode keeps this share of its stiffness. One that has lost it
-# counts as much as an error of the tolerance.
+# counts as much as an error of the tolerance. Nearer to the edge no step leads on, and the shape snaps over where
+# labels change. Designs that are still to be relaxed get there in fewer steps without that price.
 LEAST_STABLE, LAM_STABLE = 0.2, 1.0
 
 Watch = Callable[[str, Search], None]
@@ -107,18 +107,24 @@ def rounded_from(
 
 
 def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
-    """As `rounded_from`, from any state of a search in the elements of the result."""
-    weights = kept_clear(settings.weights) if how.clear else settings.weights
-    settings = replace(settings, weights=weights, round_growth=ROUND_GROWTH)
-    L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
+    """As `rounded_from`, from any state of a search in the elements of the result.
+
+    Where relaxing comes near unstable states, it goes on clear of them, and tets are decided by and by at once.
+    """
+    settings = replace(settings, round_growth=ROUND_GROWTH)
+    L, hard, held_back, tried, clear = smoothness_matrix(at.equilibria.problem), 0, 0, False, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
+        relaxed = before.phase is Phase.RELAX and at.phase is Phase.ROUND
+        if relaxed and not clear and _is_near_unstable(at):
+            clear, settings = True, replace(settings, weights=kept_clear(settings.weights))
+            at = replace(at, phase=Phase.RELAX, iteration=0, slow=0)
+            continue
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        relaxed = how.clear and before.phase is Phase.RELAX and at.phase is Phase.ROUND
-        if not tried and (hard >= HARD_STEPS or relaxed) and left <= how.most_left:
+        if not tried and (hard >= HARD_STEPS or (clear and relaxed)) and left <= how.most_left:
             found, tried = decided_by_and_by(at, settings, partial(watch, Phase.ROUND.value)), True
             if found is not None:
                 return found
@@ -130,6 +136,11 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
 def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:
     """The objective that also keeps the median shape clear of unstable states."""
     return weights.replace(least_stable=LEAST_STABLE, lam_stable=LAM_STABLE)
+
+
+def _is_near_unstable(at: Search) -> bool:
+    ratios = soft_modes(at.equilibria, at.design.rho, at.design.median).ratios
+    return bool((ratios < LEAST_STABLE).any())
 
 
 def _is_hard(after: Search) -> bool:

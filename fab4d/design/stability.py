@@ -103,8 +103,8 @@ class Softening:
 
     values (k,) : what the ratio lacks of the least one, relative to it, times the root of 2 lam_stable; half of their
     squares sum to the penalty
-    rows (k, 3N), by_density (k, m) : their derivatives with respect to x and to the density, modes and K+ held: what
-    K+ changes counts as many times less as the ratio is below 1
+    rows (k, 3N), by_density (k, m) : their derivatives with respect to x and to the density, K+ held: what that changes
+    counts in proportion to the ratio, which is small
     """
 
     values: FloatArray

@@ -14,7 +14,6 @@ from fab4d.design.finish import (
     FINER_MESH,
     MOST_HELD_BACK,
     OTHER_ELEMENTS,
-    Rounding,
     carried_in,
     carried_over,
     rounded_from,
@@ -203,25 +202,30 @@ def test_hard_steps_that_decide_little_end_the_rounding(
     assert (len(made) == MOST_HELD_BACK) == ends
 
 
-@pytest.mark.parametrize("how", [OTHER_ELEMENTS, FINER_MESH])
-def test_on_finer_meshes_the_median_shape_keeps_clear_of_unstable_states(
-    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, how: Rounding
+@pytest.mark.parametrize("near", [True, False])
+def test_relaxing_goes_on_clear_of_unstable_states_where_it_comes_near_them(
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, near: bool
 ) -> None:
-    prices = list[float]()
+    """Once: there it may be held, and rounding follows."""
+    made = list[tuple[Phase, int, float]]()
 
     def step(at: Search, settings: ReducedSettings, _: object) -> Search:
-        prices.append(settings.weights.lam_stable)
-        return replace(at, phase=Phase.ROUND if at.phase is Phase.RELAX else Phase.DONE)
+        made.append((at.phase, at.iteration, settings.weights.lam_stable))
+        assert len(made) < 10
+        return replace(at, phase=Phase.ROUND if at.phase is Phase.RELAX else Phase.DONE, iteration=7)
 
     monkeypatch.setattr(finish, "STEPS", {Phase.RELAX: step, Phase.ROUND: step})
+    monkeypatch.setattr(finish, "_is_near_unstable", lambda _: near)
     carried = carried_in(quadratic, found)
     assert carried is not None
-    rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(how, most_left=0.0))
-    assert prices == [finish.LAM_STABLE * how.clear] * 2
+    rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(OTHER_ELEMENTS, most_left=0.0))
+    price = finish.LAM_STABLE
+    clear = [(Phase.RELAX, 0, price), (Phase.ROUND, 7, price)]
+    assert made == [(Phase.RELAX, 0, 0.0), *(clear if near else [(Phase.ROUND, 7, 0.0)])]
 
 
 @pytest.mark.parametrize("relaxing", [1, 2])
-def test_on_finer_meshes_most_tets_are_decided_by_and_by_once_the_design_is_relaxed(
+def test_clear_of_unstable_states_most_tets_are_decided_by_and_by_at_once(
     found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, relaxing: int
 ) -> None:
     carried, shares, phases = carried_in(quadratic, found), list[float](), list[str]()
@@ -231,10 +235,11 @@ def test_on_finer_meshes_most_tets_are_decided_by_and_by_once_the_design_is_rela
     def watched(at: Search, settings: ReducedSettings, watch: Callable[[Search], None]) -> Search | None:
         shares.append(undecided_fraction(at.design.rho))
         assert settings.weights.lam_stable == finish.LAM_STABLE
-        assert phases == ["carried over"] + relaxing * ["relax"]
+        assert phases == ["carried over"] + 2 * relaxing * ["relax"]
         return real(at, settings, watch)
 
     monkeypatch.setattr(finish, "decided_by_and_by", watched)
+    monkeypatch.setattr(finish, "_is_near_unstable", lambda _: True)
     how = replace(FINER_MESH, relax_iterations=relaxing)
     at = rounded_from(carried, settings_for(quadratic), lambda phase, _: phases.append(phase), how)
     assert len(shares) == 1

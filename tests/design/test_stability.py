@@ -13,11 +13,12 @@ from shapes.boxes import box
 from fab4d.design import finish, stability
 from fab4d.design.equilibria import Equilibria, Median
 from fab4d.design.finish import kept_clear
-from fab4d.design.gauss_newton import build_model, evaluate
+from fab4d.design.gauss_newton import build_model, equilibrate, evaluate, held_positions
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import build_patches
 from fab4d.design.problem import Problem, build_problem
-from fab4d.design.reduced import refit
+from fab4d.design.reduced import Search, refit
+from fab4d.design.sensitivity import Change
 from fab4d.design.stability import soft_modes, softening, softening_penalty
 from fab4d.solvers.linear import Factor, SingularMatrixError
 
@@ -145,19 +146,36 @@ def test_modes_are_scaled_by_their_positive_stiffness() -> None:
 
 
 def test_the_gradient_of_the_objective_counts_soft_modes() -> None:
-    """By central differences in the held position, which moves the median shape along its load."""
-    problem = strut()
-    rho = even(problem)
-    weights, L = SOFT.replace(error_scale=1e3), smoothness_matrix(problem)
-    equilibria, median = pushed(problem, rho, 0.006)
-    centre, values = median.x, []
-    design = held_design(equilibria, rho, centre, 1e-9)
-    model = build_model(equilibria, weights, L, design)
-    step = 1e-4 * np.array([1.0, 0.0, 0.0])
+    """By central differences in the held position, near instability, where what K+ changes counts little.
+
+    A density acts both by itself and by the shape.
+    """
+    problem, weights = strut(), SOFT.replace(error_scale=1e3, least_stable=0.3)
+    rho, L = even(problem), smoothness_matrix(problem)
+    equilibria, median = pushed(problem, rho, 0.017)
+    design = held_design(equilibria, rho, median.x, 1e-9)
+    model, careless = (build_model(equilibria, each, L, design) for each in (weights, weights.replace(lam_stable=0.0)))
+    held, step, values = held_positions(equilibria, design.median), np.array([[1e-4, 0.0, 0.0]]), []
     for sign in (-1, 1):
-        moved = design.median.x + sign * step * ~problem.clamp[:, None]
-        values.append(evaluate(equilibria, weights, L, held_design(equilibria, rho, moved, 1e-9)))
-    assert model.gradient_c @ step == pytest.approx((values[1] - values[0]) / 2, rel=0.1)
+        at = equilibrate(equilibria, rho, held + sign * step, median.x, median.forces, design.final.y, 1e-9, 60)
+        assert at is not None
+        values.append(evaluate(equilibria, weights, L, at))
+    assert model.gradient_c @ step.ravel() == pytest.approx((values[1] - values[0]) / 2, rel=0.1)
+    soft = softening(equilibria, weights, rho, design.median)
+    by_shape = model.lin.adjoint_rho(Change(soft.rows.T @ soft.values, np.zeros(3), np.zeros(median.x.size)))
+    np.testing.assert_allclose(
+        model.gradient_rho, careless.gradient_rho + soft.density_gradient() + by_shape, rtol=1e-6, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("by", "near"), [(0.006, False), (0.017, True)])
+def test_what_is_near_unstable(by: float, near: bool) -> None:
+    problem = strut()
+    equilibria, median = pushed(problem, even(problem), by)
+    at = Search(equilibria, held_design(equilibria, even(problem), median.x, 1e-9))
+    ratio = soft_modes(equilibria, even(problem), median).ratios[0]
+    assert (0 < ratio < finish.LEAST_STABLE) == near
+    assert finish._is_near_unstable(at) == near
 
 
 def test_half_the_squares_of_the_values_are_the_penalty() -> None:
