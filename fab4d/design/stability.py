@@ -104,7 +104,7 @@ class Softening:
     values (k,) : what the ratio lacks of the least one, relative to it, times the root of 2 lam_stable; half of their
     squares sum to the penalty
     rows (k, 3N), by_density (k, m) : their derivatives with respect to x and to the density, K+ held: what that changes
-    counts in proportion to the ratio, which is small
+    counts in proportion to the ratio, so that they are exact at instability and rough far from it
     """
 
     values: FloatArray
