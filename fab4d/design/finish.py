@@ -53,7 +53,7 @@ class Rounding:
 OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE)
 # Where other elements have been searched themselves, steps are hard because of them.
 SEARCHED = Rounding(relax_iterations=0, most_left=1.0)
-# It is farther from that, and a step takes long.
+# The design is farther from its best on a finer mesh than in other elements of the same one.
 FINER_MESH = Rounding(relax_iterations=8, most_left=LAST_SHARE)
 # A median shape is clear of unstable states where each mode keeps this share of its stiffness. One that has lost it
 # counts as much as an error of the tolerance. Nearer to the edge no step leads on, and the shape snaps over where
@@ -112,13 +112,14 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
     Where relaxing comes near unstable states, it goes on clear of them, and tets are decided by and by at once.
     """
     settings = replace(settings, round_growth=ROUND_GROWTH)
-    L, hard, held_back, tried, clear = smoothness_matrix(at.equilibria.problem), 0, 0, False, False
+    L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
     while at.phase is not Phase.DONE:
         before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
         watch(before.phase.value, at)
         relaxed = before.phase is Phase.RELAX and at.phase is Phase.ROUND
+        clear = settings.weights.lam_stable > 0
         if relaxed and not clear and _is_near_unstable(at):
-            clear, settings = True, replace(settings, weights=kept_clear(settings.weights))
+            settings = replace(settings, weights=kept_clear(settings.weights))
             at = replace(at, phase=Phase.RELAX, iteration=0, slow=0)
             continue
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))

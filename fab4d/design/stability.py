@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.sensitivity import forces_by_density
 from fab4d.mesh.tetmesh import FloatArray
-from fab4d.solvers.linear import Factor, SingularMatrixError
+from fab4d.solvers.linear import Factor, SingularMatrixError, product
 
 # So many modes are looked at, those nearest to instability.
 MODES = 6
@@ -53,31 +53,23 @@ def _found(equilibria: Equilibria, rho: FloatArray, x: FloatArray, factor: Facto
     n, pattern, W = x.size, equilibria.held_pattern, equilibria.operator
     if factor is None:
         factor = equilibria.held_analysis.factor(equilibria.median_tangent(rho, x))
-    moves = np.ones(n, bool)
-    moves[equilibria.held_mask.fixed] = False
-    count = min(MODES, int(moves.sum()) - 1)
-    if count < 1:
-        return SoftModes(np.zeros(0), np.zeros((0, *x.shape)))
-    data, size = equilibria.median_tangent(rho, x, spd=True), pattern.n_dofs
-    lower = csc_array((data, pattern.indices, pattern.indptr), shape=(size, size))[:n, :n]
-    diagonal = lower.diagonal()
+    data = equilibria.median_tangent(rho, x, spd=True)
 
     def stiffness(u: FloatArray) -> FloatArray:
-        u = np.where(moves, u.ravel(), 0.0)
-        rig = W.T @ (W @ u.reshape(x.shape)) / RIG_COMPLIANCE
-        return np.where(moves, lower @ u + lower.T @ u - diagonal * u + rig.ravel(), 0.0)
+        # The forces that the rig answers with leave nothing of the constraints' rows.
+        rig = -W @ u.reshape(x.shape) / RIG_COMPLIANCE
+        return product(pattern.indptr, pattern.indices, data, np.concatenate([u.ravel(), rig.ravel()]))[:n]
 
     def compliance(load: FloatArray) -> FloatArray:
-        bordered = np.zeros(size)
-        bordered[:n] = np.where(moves, load.ravel(), 0.0)
-        return np.where(moves, factor.solve(bordered)[:n], 0.0)
+        return factor.solve(np.concatenate([load.ravel(), np.zeros(pattern.n_dofs - n)]))[:n]
 
     positive, inverse = (LinearOperator((n, n), matvec=each, dtype=np.float64) for each in (stiffness, compliance))
-    start = compliance(np.random.default_rng(0).standard_normal(n))
-    unstable = min(max(factor.n_negative - 3 * equilibria.patches.count, 0), count)
-    found = [
-        _lanczos(positive, inverse, start, *each) for each in ((unstable, "SA"), (count - unstable, "LA")) if each[0]
-    ]
+    load = np.random.default_rng(0).standard_normal(n)
+    load[equilibria.held_mask.fixed] = 0.0
+    start = compliance(load)
+    unstable = min(max(factor.n_negative - 3 * equilibria.patches.count, 0), MODES)
+    ends = (unstable, "SA"), (MODES - unstable, "LA")
+    found = [_lanczos(positive, inverse, start, count, which) for count, which in ends if count]
     ratios, shapes = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
     order = np.argsort(ratios)
     return SoftModes(ratios[order], shapes.T[order].reshape(-1, *x.shape))
@@ -125,8 +117,11 @@ def softening(
     modes = soft_modes(equilibria, rho, median, factor)
     soft = modes.ratios < weights.least_stable
     slope = -np.sqrt(2 * weights.lam_stable) / weights.least_stable
-    rows = [slope * _by_shape(equilibria, rho, median.x, shape).ravel() for shape in modes.shapes[soft]]
-    by_density = [slope * _by_density(equilibria, median.x, shape) for shape in modes.shapes[soft]]
+    at_x, rows, by_density = equilibria.median_gradient(rho, median.x)[0], [], []
+    for shape in modes.shapes[soft]:
+        h = _short(equilibria, median.x, shape)
+        rows.append(slope * _by_shape(equilibria, rho, median.x, shape, h, at_x).ravel())
+        by_density.append(slope * _by_density(equilibria, median.x, shape, h))
     return Softening(
         slope * (modes.ratios[soft] - weights.least_stable),
         csr_array(np.reshape(rows, (len(rows), median.x.size))),
@@ -145,21 +140,25 @@ def softening_penalty(equilibria: Equilibria, weights: ObjectiveWeights, rho: Fl
     return weights.lam_stable * float((np.maximum(lacking, 0.0) ** 2).sum())
 
 
-def _by_shape(equilibria: Equilibria, rho: FloatArray, x: FloatArray, shape: FloatArray) -> FloatArray:
-    """(N, 3) derivative of phi . K phi with respect to x: the second derivative of the nodal forces along phi."""
-    h = _short(equilibria, x, shape)
-    before, at, after = (equilibria.median_gradient(rho, x + t * shape)[0] for t in (-h, 0.0, h))
-    return (before - 2 * at + after) / h**2
+def _by_shape(
+    equilibria: Equilibria, rho: FloatArray, x: FloatArray, shape: FloatArray, h: float, at_x: FloatArray
+) -> FloatArray:
+    """(N, 3) derivative of phi . K phi with respect to x: the second derivative of the nodal forces along phi.
+
+    h : of the difference        at_x : (N, 3) these forces at x
+    """
+    before, after = (equilibria.median_gradient(rho, x + t * shape)[0] for t in (-h, h))
+    return (before - 2 * at_x + after) / h**2
 
 
-def _by_density(equilibria: Equilibria, x: FloatArray, shape: FloatArray) -> FloatArray:
+def _by_density(equilibria: Equilibria, x: FloatArray, shape: FloatArray, h: float) -> FloatArray:
     """(m,) derivative of phi . K phi with respect to the density."""
-    h = _short(equilibria, x, shape)
     before, after = (forces_by_density(equilibria, x + t * shape) for t in (-h, h))
     return np.einsum("mai,mai->m", after - before, shape[equilibria.problem.body.elements]) / (2 * h)
 
 
 def _short(equilibria: Equilibria, x: FloatArray, shape: FloatArray) -> float:
+    """A step along the shape that changes edges by a share of DIFFERENCE at most."""
     corners = equilibria.problem.body.elements[:, :4]
     edges, changes = (np.linalg.norm(each[corners[:, 1:]] - each[corners[:, :1]], axis=2) for each in (x, shape))
     return DIFFERENCE / float((changes / edges).max())

@@ -98,13 +98,13 @@ def backward_error(indptr: IntArray, indices: IntArray, data: FloatArray, x: Flo
     indptr, indices, data : lower triangle of A in CSC form        x, b : (n,) or (n, k)
     Source: Oettli and Prager, Numer. Math. 6 (1964) 405.
     """
-    residual = np.abs(b - _product(indptr, indices, data, x))
-    size = _product(indptr, indices, np.abs(data), np.abs(x)) + np.abs(b)
+    residual = np.abs(b - product(indptr, indices, data, x))
+    size = product(indptr, indices, np.abs(data), np.abs(x)) + np.abs(b)
     return float(np.max(np.divide(residual, size, out=np.zeros_like(residual), where=size > 0.0), initial=0.0))
 
 
-def _product(indptr: IntArray, indices: IntArray, data: FloatArray, x: FloatArray) -> FloatArray:
-    """A x from the lower triangle of A."""
+def product(indptr: IntArray, indices: IntArray, data: FloatArray, x: FloatArray) -> FloatArray:
+    """A x for x (n,) or (n, k); indptr, indices, data : lower triangle of A in CSC form."""
     n = len(indptr) - 1
     lower = csc_array((data, indices, indptr), shape=(n, n))
     diagonal = data[indptr[:-1]]
@@ -228,7 +228,7 @@ class _RslabAnalysis:
         changed = data.copy()
         changed[indptr[constraints]] = -_softness(indptr, indices, data)[constraints]
         size = float(np.max(np.abs(data)))
-        return _RegularisedFactor(self._symbolic.factor(changed), lambda x: _product(indptr, indices, data, x), size)
+        return _RegularisedFactor(self._symbolic.factor(changed), lambda x: product(indptr, indices, data, x), size)
 
 
 def _softness(indptr: IntArray, indices: IntArray, data: FloatArray) -> FloatArray:
