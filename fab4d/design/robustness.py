@@ -33,6 +33,7 @@ class Response:
     """What moves of the held positions c do to a design: to first order, and to its squared error to second.
 
     rms : of the design, L0         dx_dc (3N, 3K), df_dc (3K, 3K), dy_dc (3N, 3K)
+    stiffened (3N + 3K, 3K) : dx_dc and df_dc with K+ of `soft_modes` as tangent, which has no soft modes
     gradient (3K,), curvature (3K, 3K) : rms^2(c + dc) = rms^2 + 2 gradient . dc + dc . curvature dc, L0^2
     held_negative, final_negative : negative eigenvalues of the tangents, of the median's with its 3K constraints
     """
@@ -41,6 +42,7 @@ class Response:
     dx_dc: FloatArray
     df_dc: FloatArray
     dy_dc: FloatArray
+    stiffened: FloatArray
     gradient: FloatArray
     curvature: FloatArray
     held_negative: int
@@ -82,7 +84,8 @@ class Response:
 
 def response_of(equilibria: Equilibria, design: Design, lin: Linearisation) -> Response:
     """How the design, with the linear maps `lin` about it, responds to moves of its held positions."""
-    problem, y = equilibria.problem, design.final.y
+    problem, y, k = equilibria.problem, design.final.y, 3 * equilibria.patches.count
+    positive = equilibria.held_analysis.factor(equilibria.median_tangent(design.rho, design.median.x, spd=True))
     dx_dc, df_dc, dy_dc = lin.held_columns()
     error = shape_error(problem, y)
     pull = (problem.area_weights[:, None] * (error.e @ error.R)).ravel()
@@ -92,6 +95,7 @@ def response_of(equilibria: Equilibria, design: Design, lin: Linearisation) -> R
         dx_dc=dx_dc,
         df_dc=df_dc,
         dy_dc=dy_dc,
+        stiffened=_held_columns(positive, design.median.x.size, k),
         gradient=dy_dc.T @ pull,
         curvature=0.5 * (curvature + curvature.T),
         held_negative=lin.held.n_negative,
@@ -139,16 +143,34 @@ def with_moved_points(
     equilibria: Equilibria, design: Design, near: Linearisation, response: Response, dc: FloatArray
 ) -> Design | None:
     """The design once its held positions have moved by dc (K, 3), L0; None where no equilibrium is found near it."""
-    held, d = held_positions(equilibria, design.median) + dc, dc.ravel()
+    held = held_positions(equilibria, design.median) + dc
     x, f, y = design.median.x, design.median.forces, design.final.y
-    dx, df, dy = (part.reshape(-1, 3) for part in (response.dx_dc @ d, response.df_dc @ d, response.dy_dc @ d))
-    ahead = equilibria.held_turning.step(x, dx), f + df, equilibria.free_turning.step(y, dy)
+    dx, df = _ahead(equilibria, design, response, dc)
+    follow = equilibria.free_turning.step(y, near.final_follows(dx))
+    ahead = equilibria.held_turning.step(x, dx), f + df, follow
     # From far ahead the way past unstable states is long, and the other one mostly leads there too.
     for guess, stay in ((ahead, True), ((x, f, y), False)):
         found = equilibrate(equilibria, design.rho, held, *guess, SEARCH_TOLERANCE, NEWTON_STEPS, stay=stay, near=near)
         if found is not None:
             return found
     return None
+
+
+def _ahead(equilibria: Equilibria, design: Design, response: Response, dc: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Changes dx (N, 3) and df (K, 3) of the median shape when the held positions move by dc (K, 3).
+
+    A soft mode moves by far less than the tangent tells, for it stiffens on the way. Without soft modes the prediction
+    is too stiff, but nearer then: of the two the one with the lower energy.
+    """
+    x, d, n = design.median.x, dc.ravel(), design.median.x.size
+    stiffened = response.stiffened @ d
+    ways = (response.dx_dc @ d, response.df_dc @ d), (stiffened[:n], stiffened[n:])
+
+    def energy(way: tuple[FloatArray, FloatArray]) -> float:
+        return equilibria.median_gradient(design.rho, equilibria.held_turning.step(x, way[0].reshape(-1, 3)))[1]
+
+    dx, df = min(ways, key=energy)
+    return dx.reshape(-1, 3), df.reshape(-1, 3)
 
 
 def with_scaled_modulus(

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_the_model_tells_the_simulated_error(bent: tuple[Equilibria, Design]) ->
 
 def made_up(H: np.ndarray, g: np.ndarray, error: float = 0.01) -> Response:
     none = np.zeros((0, len(g)))
-    return Response(error, none, np.zeros((len(g), len(g))), none, g, H, 0, 0)
+    return Response(error, none, np.zeros((len(g), len(g))), none, none, g, H, 0, 0)
 
 
 @settings(max_examples=30, deadline=None)
@@ -312,6 +313,38 @@ def test_moved_points_lead_past_unstable_states_from_the_state_before_alone(
     assert (first, second) == (True, False)
     np.testing.assert_array_equal(before, design.median.x)
     assert np.abs(ahead - before).max() > 1e-4
+
+
+def test_at_rest_no_mode_is_soft() -> None:
+    """There elements have no negative curvature to cut off; a pushed column has."""
+    rest, pressed = (response_of(*pushed(bar((5, 2, 2), 0.0), share)) for share in (0.0, -0.06))
+    np.testing.assert_allclose(rest.stiffened, np.vstack([rest.dx_dc, rest.df_dc]), atol=1e-9)
+    differ = pressed.stiffened - np.vstack([pressed.dx_dc, pressed.df_dc])
+    assert np.abs(differ[: len(pressed.dx_dc)]).max() > 0.01
+
+
+@pytest.mark.parametrize("softer", [1.0, 30.0])
+def test_moved_points_are_followed_without_soft_modes_where_these_are_told_to_move_too_far(
+    bent: tuple[Equilibria, Design], monkeypatch: pytest.MonkeyPatch, softer: float
+) -> None:
+    """softer : how many times too far the tangent tells that the shape moves"""
+    equilibria, design = bent
+    near, dc, guesses = maps(equilibria, design), 0.02 * direction(equilibria), list[np.ndarray]()
+    true = response_of(equilibria, design)
+    told = replace(true, dx_dc=softer * true.dx_dc)
+
+    def watched(*args: Any, **options: Any) -> Design | None:
+        guesses.append(args[3])
+        return equilibrate(*args, **options)
+
+    monkeypatch.setattr(robustness, "equilibrate", watched)
+    found, other = (with_moved_points(equilibria, design, near, response, dc) for response in (told, true))
+    assert found is not None
+    assert other is not None
+    np.testing.assert_allclose(found.median.x, other.median.x, atol=1e-6)
+    x = design.median.x
+    followed = true.dx_dc if softer == 1.0 else true.stiffened[: x.size]
+    np.testing.assert_array_equal(guesses[0], equilibria.held_turning.step(x, (followed @ dc.ravel()).reshape(x.shape)))
 
 
 @pytest.mark.parametrize(("factor", "first"), [(1.01, 1.0), (100.0, 0.25)])
