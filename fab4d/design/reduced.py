@@ -49,7 +49,7 @@ DEARER = 0.86
 MOST_STUCK, LEAST_DECIDED = 3, 0.02
 # Of what is left then, this share is rounded at a time, or so many tets, or this share of all, with as many tries of a
 # step that follows.
-DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-3, 3
+DECIDED_SHARE, FEWEST_DECIDED, LEAST_SHARE, DECIDED_TRIES = 0.5, 4, 1e-2, 3
 # Densities are rounded in steps of at least this share of the way. Where these end before, the step that follows may
 # clear the way for others, but not so many times in a row.
 DECIDED_STEP, MOST_BARRED = 0.1, 3
