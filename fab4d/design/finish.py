@@ -59,6 +59,9 @@ FINER_MESH = Rounding(relax_iterations=8, most_left=LAST_SHARE)
 # counts as much as an error of the tolerance. Nearer to the edge no step leads on, and the shape snaps over where
 # labels change. Designs that are still to be relaxed get there in fewer steps without that price.
 LEAST_STABLE, LAM_STABLE = 0.2, 1.0
+# Rounding takes stiffness from modes: where relaxing ends with less of it in one than this share, the price is paid
+# from then on.
+SOFT = 0.4
 
 Watch = Callable[[str, Search], None]
 
@@ -109,7 +112,8 @@ def rounded_from(
 def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
     """As `rounded_from`, from any state of a search in the elements of the result.
 
-    Where relaxing comes near unstable states, it goes on clear of them, and tets are decided by and by at once.
+    Where relaxing comes near unstable states, it goes on clear of them, and tets are decided by and by at once. Where
+    it ends not far from there, rounding keeps clear of them.
     """
     settings = replace(settings, round_growth=ROUND_GROWTH)
     L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
@@ -118,8 +122,10 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
         watch(before.phase.value, at)
         relaxed = before.phase is Phase.RELAX and at.phase is Phase.ROUND
         clear = settings.weights.lam_stable > 0
-        if relaxed and not clear and _is_near_unstable(at):
+        ratio = _least_ratio(at) if relaxed and not clear else np.inf
+        if ratio < SOFT:
             settings = replace(settings, weights=kept_clear(settings.weights))
+        if ratio < LEAST_STABLE:
             at = replace(at, phase=Phase.RELAX, iteration=0, slow=0)
             continue
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
@@ -139,9 +145,9 @@ def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:
     return weights.replace(least_stable=LEAST_STABLE, lam_stable=LAM_STABLE)
 
 
-def _is_near_unstable(at: Search) -> bool:
-    ratios = soft_modes(at.equilibria, at.design.rho, at.design.median).ratios
-    return bool((ratios < LEAST_STABLE).any())
+def _least_ratio(at: Search) -> float:
+    """Of the modes of the median shape; inf where none is found."""
+    return float(soft_modes(at.equilibria, at.design.rho, at.design.median).ratios.min(initial=np.inf))
 
 
 def _is_hard(after: Search) -> bool:

@@ -202,11 +202,11 @@ def test_hard_steps_that_decide_little_end_the_rounding(
     assert (len(made) == MOST_HELD_BACK) == ends
 
 
-@pytest.mark.parametrize("near", [True, False])
+@pytest.mark.parametrize(("ratio", "again"), [(0.9, False), (0.3, False), (0.1, True)])
 def test_relaxing_goes_on_clear_of_unstable_states_where_it_comes_near_them(
-    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, near: bool
+    found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, ratio: float, again: bool
 ) -> None:
-    """Once: there it may be held, and rounding follows."""
+    """Once: there it may be held, and rounding follows. Not far from them, rounding keeps clear at least."""
     made = list[tuple[Phase, int, float]]()
 
     def step(at: Search, settings: ReducedSettings, _: object) -> Search:
@@ -215,13 +215,12 @@ def test_relaxing_goes_on_clear_of_unstable_states_where_it_comes_near_them(
         return replace(at, phase=Phase.ROUND if at.phase is Phase.RELAX else Phase.DONE, iteration=7)
 
     monkeypatch.setattr(finish, "STEPS", {Phase.RELAX: step, Phase.ROUND: step})
-    monkeypatch.setattr(finish, "_is_near_unstable", lambda _: near)
+    monkeypatch.setattr(finish, "_least_ratio", lambda _: ratio)
     carried = carried_in(quadratic, found)
     assert carried is not None
     rounded_from(carried, settings_for(quadratic), lambda *_: None, replace(OTHER_ELEMENTS, most_left=0.0))
-    price = finish.LAM_STABLE
-    clear = [(Phase.RELAX, 0, price), (Phase.ROUND, 7, price)]
-    assert made == [(Phase.RELAX, 0, 0.0), *(clear if near else [(Phase.ROUND, 7, 0.0)])]
+    relaxed = [(Phase.RELAX, 0, 0.0), *([(Phase.RELAX, 0, finish.LAM_STABLE)] if again else [])]
+    assert made == [*relaxed, (Phase.ROUND, 7, 0.0 if ratio > finish.SOFT else finish.LAM_STABLE)]
 
 
 @pytest.mark.parametrize("relaxing", [1, 2])
@@ -239,7 +238,7 @@ def test_clear_of_unstable_states_most_tets_are_decided_by_and_by_at_once(
         return real(at, settings, watch)
 
     monkeypatch.setattr(finish, "decided_by_and_by", watched)
-    monkeypatch.setattr(finish, "_is_near_unstable", lambda _: True)
+    monkeypatch.setattr(finish, "_least_ratio", lambda _: 0.1)
     how = replace(FINER_MESH, relax_iterations=relaxing)
     at = rounded_from(carried, settings_for(quadratic), lambda phase, _: phases.append(phase), how)
     assert len(shares) == 1

@@ -164,14 +164,12 @@ def test_the_gradient_of_the_objective_counts_soft_modes() -> None:
     )
 
 
-@pytest.mark.parametrize(("by", "near"), [(0.006, False), (0.017, True)])
-def test_what_is_near_unstable(by: float, near: bool) -> None:
+@pytest.mark.parametrize("by", [0.006, 0.017])
+def test_the_least_ratio_is_that_of_the_softest_mode(by: float) -> None:
     problem = strut()
     equilibria, median = pushed(problem, even(problem), by)
     at = Search(equilibria, held_design(equilibria, even(problem), median.x, 1e-9))
-    ratio = soft_modes(equilibria, even(problem), median).ratios[0]
-    assert (0 < ratio < finish.LEAST_STABLE) == near
-    assert finish._is_near_unstable(at) == near
+    assert finish._least_ratio(at) == pytest.approx(soft_modes(equilibria, even(problem), median).ratios[0], rel=1e-3)
 
 
 def test_half_the_squares_of_the_values_are_the_penalty() -> None:
