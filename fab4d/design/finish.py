@@ -43,10 +43,12 @@ class Rounding:
 
     relax_iterations : steps of relaxing at most
     most_left : share of all tets, at most, that is decided by and by
+    worst_rms : a relaxed design with a larger RMS error, L0, is not rounded
     """
 
     relax_iterations: int
     most_left: float
+    worst_rms: float = np.inf
 
 
 # The design is near already.
@@ -102,7 +104,7 @@ def rounded_from(
     """A near 0/1 design from a relaxed one that was carried over from another discretisation.
 
     watch : is shown the phase and the state after each step
-    None where no equilibria lead to 0 and 1.
+    None where no equilibria lead to 0 and 1, or the relaxed design is none to round.
     """
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
@@ -128,6 +130,8 @@ def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Roundin
         if ratio < LEAST_STABLE:
             at = replace(at, phase=Phase.RELAX, iteration=0, slow=0)
             continue
+        if relaxed and at.relaxed_rms > how.worst_rms:
+            return None
         left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
         hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
         held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0

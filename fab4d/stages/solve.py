@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import SEARCHED, carried_in, rounded_from, rounded_on
+from fab4d.design.finish import OTHER_ELEMENTS, SEARCHED, carried_in, rounded_from, rounded_on
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
@@ -50,6 +50,9 @@ LINEAR_ROUNDS = {
     "what": "rounding in quadratic elements",
     "why": "the relaxed design is near to that in linear ones",
 }
+# Quadratic elements lose a design if, relaxed in them, it errs by more than this multiple of its error in linear ones
+# and by more than this share of the tolerance.
+LOST, LOST_SHARE = 2.25, 0.75
 NOT_QUADRATIC = {"what": "rounding in quadratic elements", "why": "the relaxed design misses the tolerance by far"}
 # Where MANY_TETS are searched, for no coarser mesh does, they are rounded in about half the steps, none of which leads
 # past unstable states: that takes many times longer.
@@ -243,17 +246,35 @@ def _finished(
     if _rms(carried) <= LINEAR_HOLDS * relaxed.relaxed_rms:
         trace.add("carried over", carried)
         return _Finish(left_out=(LINEAR_ROUNDS,))
-    finished = rounded_from(carried, settings, trace.add)
-    if finished is None and _rms(carried) > settings.weights.error_scale:
-        finished = _found_in(carried.equilibria.problem, settings, trace)
+    finished = _rounded_in(carried, relaxed.relaxed_rms, settings, trace)
     return _Finish(finished if affordable(finished, profile["goal"]) else None)
+
+
+def _rounded_in(carried: Search, linear_rms: float, settings: ReducedSettings, trace: Trace) -> Search | None:
+    """A near 0/1 design in the elements that a relaxed one was carried over to, or found there where these lose it.
+
+    linear_rms : RMS error, L0, of the relaxed design in linear elements        None where no equilibria lead to one
+    """
+    tolerance, reached = settings.weights.error_scale, carried
+    worst = max(LOST * linear_rms, LOST_SHARE * tolerance)
+
+    def watch(phase: str, at: Search) -> None:
+        nonlocal reached
+        reached = at
+        trace.add(phase, at)
+
+    rounded = rounded_from(carried, settings, watch, replace(OTHER_ELEMENTS, worst_rms=worst))
+    lost = reached.relaxed_rms > worst
+    if rounded is None and _rms(carried) > tolerance:
+        rounded = _found_in(carried.equilibria.problem, settings, trace)
+    return rounded_from(carried, settings, trace.add) if rounded is None and lost else rounded
 
 
 def _found_in(problem: Problem, settings: ReducedSettings, trace: Trace) -> Search | None:
     """A near 0/1 design searched from the start; None where none is found, or the relaxed one misses the tolerance.
 
     It takes minutes, but what linear elements find is of no use where they lock: quadratic ones miss the tolerance with
-    it, and steps from there lead past unstable states.
+    it, and steps from there lead past unstable states or to little.
     """
     phase = "start"
 

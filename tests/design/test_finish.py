@@ -177,6 +177,24 @@ def test_what_steps_leave_undecided_is_rounded_up_to_a_share(
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
 
 
+@pytest.mark.parametrize(("worst", "rounds"), [(0.99, False), (1.01, True)])
+def test_a_relaxed_design_that_errs_too_much_is_not_rounded(
+    found: Search, quadratic: Problem, worst: float, rounds: bool
+) -> None:
+    """worst : in errors of the relaxed design"""
+    carried, settings, relaxed = carried_in(quadratic, found), settings_for(quadratic), list[float]()
+    assert carried is not None
+
+    def watch(_: str, at: Search) -> None:
+        if at.phase is Phase.ROUND and not at.iteration:
+            relaxed.append(at.relaxed_rms)
+
+    assert rounded_from(carried, settings, watch) is not None
+    how = replace(OTHER_ELEMENTS, worst_rms=worst * relaxed[0])
+    assert (rounded_from(carried, settings, watch, how) is not None) == rounds
+    assert relaxed[0] == relaxed[1] > 0
+
+
 @pytest.mark.parametrize(("share_left", "ends"), [(0.95, True), (0.8, False)])
 def test_hard_steps_that_decide_little_end_the_rounding(
     found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch, share_left: float, ends: bool

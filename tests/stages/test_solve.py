@@ -10,7 +10,7 @@ from bent_bar import PROFILE, bent_bar
 from shapes.boxes import box
 
 from fab4d.design import reduced
-from fab4d.design.finish import carried_in
+from fab4d.design.finish import OTHER_ELEMENTS, Rounding, carried_in
 from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import ReducedSettings, Search, at_rest, undecided_fraction
@@ -204,6 +204,38 @@ def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
     solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
     assert [problem.body.order for problem in asked] == [2] * searched
+
+
+@pytest.mark.parametrize("found_there", [True, False])
+def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_no_other(
+    relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings],
+    monkeypatch: pytest.MonkeyPatch,
+    found_there: bool,
+) -> None:
+    bar, found, settings = relaxed_bar
+    done = list[str]()
+    tolerance = 0.5 * found.relaxed_rms
+    settings = replace(settings, weights=settings.weights.replace(error_scale=tolerance))
+
+    def rounding(carried: Search, _: ReducedSettings, watch: Any, how: Rounding = OTHER_ELEMENTS) -> Search | None:
+        done.append("rounded" if how.worst_rms == np.inf else "judged")
+        assert how.worst_rms in {solve.LOST * found.relaxed_rms, np.inf}
+        at = replace(carried, relaxed_rms=1.01 * solve.LOST * found.relaxed_rms)
+        watch("relax", at)
+        return at if how.worst_rms == np.inf else None
+
+    def searching(*_: Any) -> Search | None:
+        done.append("searched")
+        return found if found_there else None
+
+    for name, value in (("rounded_from", rounding), ("_found_in", searching), ("far_off", lambda *_: False)):
+        monkeypatch.setattr(solve, name, value)
+    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+    profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
+    finish = solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
+    assert finish.found is not None
+    assert (finish.found is found) == found_there
+    assert done == ["judged", "searched", *([] if found_there else ["rounded"])]
 
 
 @pytest.mark.parametrize(("tolerance", "reached"), [(1.0, True), (1e-6, False)])
