@@ -243,6 +243,24 @@ def tradeoff(scene: Path, out: Path | None, points: str | None, prices: str | No
     click.echo("\n".join(tradeoff_summary(job.workspace)))
 
 
+@main.command(cls=Command)
+@_scene_command
+@click.option("--force", is_flag=True, help="Simulate finished cases again.")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def stress(scene: Path, out: Path | None, force: bool, quiet: bool) -> None:
+    """Check numerical stability: the design with stiff and extreme materials.
+
+    The finished design is loaded, cooled and unloaded anew with stiffness contrasts and bulk moduli up to a thousand
+    times as large, in other sizes and far from the origin. Runs the stages that it needs; finished cases are kept.
+    """
+    from fab4d.runner.runner import execute_study
+    from fab4d.runner.stress import stress_summary
+
+    job = _open_job(scene, out)
+    execute_study(job, "stress", {}, force, _display(quiet))
+    click.echo("\n".join(stress_summary(job.workspace)))
+
+
 def _numbers(option: str, text: str | None, kind: type) -> tuple[Any, ...] | None:
     """Numbers above 0 that are separated by commas."""
     if text is None:

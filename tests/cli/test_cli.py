@@ -15,6 +15,8 @@ from click.testing import CliRunner, Result
 from fab4d import __version__, errors
 from fab4d.cli import USAGE_EXIT_CODE, main
 from fab4d.io.csvtable import csv_bytes
+from fab4d.report.stress import COLUMNS as STRESS_COLUMNS
+from fab4d.report.stress import stress_csv
 from fab4d.report.tradeoff import COLUMNS
 from fab4d.runner.table import stage_table
 
@@ -268,6 +270,25 @@ def test_bench_compares_the_finished_runs_and_draws_them(scene: Path, stages: di
     assert (tmp_path / "plots" / "all.png").read_bytes().startswith(b"\x89PNG")
     assert fab4d("bench", "runs/other", "--markdown").stdout.splitlines()[-1].startswith("| other | 1 | 8 |")
     assert fab4d("bench", scene).exit_code == errors.ArtifactError.exit_code
+
+
+@pytest.mark.usefixtures("stages")
+def test_a_stress_study_tells_its_cases_and_where_they_are(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def study(_inputs: Any, _profile: Any, _monitor: Any) -> dict[str, Any]:
+        row = dict.fromkeys(STRESS_COLUMNS, 1.0) | {"case": "as designed", "solved": False, "unloaded": 0.5}
+        report = {"cases": 1, "solved": 0, "largest_residual": None}
+        return {"stress_csv": stress_csv([row]), "stress_report": report}
+
+    module = ModuleType("stress")
+    module.run = study  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fab4d.stages.stress", module)
+    told = fab4d("stress", scene, "--out", tmp_path / "stressed")
+    assert told.exit_code == 0, told.output
+    assert "NOT SOLVED" in told.output
+    assert "solved 0 of 1 cases\n" in told.output
+    assert (tmp_path / "stressed" / "stress.csv").read_text().startswith("case,solved")
 
 
 # -- a row of a tradeoff, picked
