@@ -201,7 +201,18 @@ def _careful(sensitivity: Mapping[str, Any] | None) -> str:
         "positions about the designed ones. Where it holds for the worst two pads, it stands in for the others and for "
         f"random directions. {JUMPS.capitalize()}: no such shape was found near the designed one."
     )
-    return f"{_warnings(sensitivity)}<table>{head}{rows}</table><p>{note}</p>"
+    return f"{_warnings(sensitivity)}<table>{head}{rows}</table><p>{note}</p>{_softest(sensitivity['softest'])}"
+
+
+def _softest(softest: Mapping[str, Any] | None) -> str:
+    """How near the held part is to buckling."""
+    if softest is None:
+        return ""
+    share, place = f"{100 * softest['stiffness_left']:.0f} %", _triple(softest["at_mm"], 0)
+    return (
+        f"<p>Held at its points, the hot part gives way most easily near ({place}) mm of the printed part: of its "
+        f"stiffness at rest {share} is left there; at 0 % it buckles.</p>"
+    )
 
 
 def _warnings(sensitivity: Mapping[str, Any] | None) -> str:

@@ -20,6 +20,7 @@ from fab4d.design.robustness import (
     with_scaled_modulus,
 )
 from fab4d.design.sensitivity import Linearisation, linearise
+from fab4d.design.stability import soft_modes
 from fab4d.solvers.linear import SingularMatrixError
 from fab4d.solvers.threads import side_by_side
 from fab4d.stages._design import patches_of, problem_of
@@ -61,9 +62,10 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     report = {"stable": not reasons, "instability": _instability_figures(unstable), "reasons": reasons}
     if reasons:
         return {"sensitivity_report": _left_out("the state is not stable") | report}
+    softest = _softest_figures(equilibria, design, lin)
     changes = _changes(equilibria, design, lin, response, monitor)
     not_forced = [] if changes["force"]["smaller"]["simulated"] else [NOT_FORCED]
-    return {"sensitivity_report": report | changes | {"left_out": not_forced}}
+    return {"sensitivity_report": report | {"softest": softest} | changes | {"left_out": not_forced}}
 
 
 def _why_not(state: Mapping[str, Any], verify_report: Mapping[str, Any]) -> str | None:
@@ -106,6 +108,17 @@ def _instability_figures(unstable: Instability) -> dict[str, Any]:
         "dead_loads": unstable.dead_loads,
         "points": (np.flatnonzero(unstable.points) + 1).tolist(),
     }
+
+
+def _softest_figures(equilibria: Equilibria, design: Design, lin: Linearisation) -> dict[str, Any] | None:
+    """Of the mode of the held median shape that is nearest to buckling: what is left of its stiffness, and where on the
+    permanent shape it moves most; None where no mode is found."""
+    modes = soft_modes(equilibria, design.rho, design.median, lin.held)
+    if not len(modes.ratios):
+        return None
+    body, L0 = equilibria.problem.body, equilibria.problem.length
+    node = int(np.linalg.norm(modes.shapes[0], axis=1).argmax())
+    return {"stiffness_left": float(modes.ratios[0]), "at_mm": (body.X[node] * L0).tolist()}
 
 
 # -- changes

@@ -30,6 +30,7 @@ def sensitivity_report() -> dict[str, Any]:
     return {
         "stable": True,
         "instability": {"held": 0, "final": 0, "dead_loads": 2, "points": []},
+        "softest": {"stiffness_left": 0.217, "at_mm": [12.0, 3.0, -0.2]},
         "rms_mm": 0.15,
         "hold": {
             "change_mm": 1.0,

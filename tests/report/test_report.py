@@ -13,6 +13,7 @@ from PIL import Image
 from fab4d.errors import ArtifactError
 from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal
+from fab4d.report.page import _careful
 from fab4d.runner.summary import report_lines
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.report import run
@@ -105,6 +106,12 @@ def test_printing_warns_without_rejecting(inputs, profile):
     assert printing["checks"][0]["check"] == "walls"
     row = "<td>walls</td><td>0.25 of it at (1, 2, 3) mm</td><td>at most 0.001 of it</td>"
     assert row + '<td class="outcome">warns</td>' in result["report_html"].decode()
+
+
+def test_how_near_the_part_is_to_buckling_is_told_where_it_is_known(result, sensitivity):
+    page = result["report_html"].decode()
+    assert "near (12, 3, 0) mm of the printed part: of its stiffness at rest 22 % is left there" in page
+    assert _careful(sensitivity | {"softest": None}).count("<p>") == _careful(sensitivity).count("<p>") - 1
 
 
 def test_sensitivity_is_told_on_the_page(result, sensitivity):

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import Design
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.design.robustness import Instability
@@ -17,7 +18,7 @@ from fab4d.mesh.distance import shape_error
 from fab4d.mesh.measures import vertex_areas
 from fab4d.solvers.linear import SingularMatrixError
 from fab4d.stages import sensitivity
-from fab4d.stages._design import patch_arrays, problem_of
+from fab4d.stages._design import patch_arrays, patches_of, problem_of
 from fab4d.stages.monitor import SilentMonitor
 
 CARD = load_material("paper-corrected", Path())
@@ -158,6 +159,29 @@ def test_figures_grow_with_the_part(mesh: Arrays, report: dict[str, Any], monkey
         10 * report["modulus"]["glassy"]["softer"]["rms_mm"], rel=1e-4
     )
     assert large["instability"] == report["instability"]
+
+
+def test_the_softest_mode_is_told_with_its_place(inputs: dict[str, Any], report: dict[str, Any]) -> None:
+    mesh, softest = inputs["mesh"], report["softest"]
+    problem = problem_of(mesh, CARD, "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["state"]))
+    design = sensitivity._verified_design(equilibria, inputs["labels"]["smp"].astype(np.float64), inputs["state"])
+    tangent, positive = (equilibria.median_tangent(design.rho, design.median.x, spd=spd) for spd in (False, True))
+    n, pattern = design.median.x.size, equilibria.held_pattern
+    W = np.kron(equilibria.operator.toarray(), np.eye(3))
+    dense = []
+    for data in (tangent, positive):
+        K = np.zeros((pattern.n_dofs, pattern.n_dofs))
+        K[pattern.indices, pattern.column_of_entry()] = data
+        K = K[:n, :n]
+        dense.append(np.tril(K) + np.tril(K, -1).T + W.T @ W / RIG_COMPLIANCE)
+    free = np.setdiff1d(np.arange(n), equilibria.held_mask.fixed)
+    ratios, shapes = eigh(*(K[np.ix_(free, free)] for K in dense))
+    assert softest["stiffness_left"] == pytest.approx(ratios[0], rel=0.02)
+    shape = np.zeros(n)
+    shape[free] = shapes[:, 0]
+    node = np.linalg.norm(shape.reshape(-1, 3), axis=1).argmax()
+    np.testing.assert_allclose(softest["at_mm"], mesh["X"][node], atol=1e-9)
 
 
 def test_what_cannot_be_measured_is_left_out(inputs: dict[str, Any]) -> None:
