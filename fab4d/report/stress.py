@@ -13,12 +13,15 @@ COLUMNS = (
     "load_steps",
     "residual_median",
     "residual_final",
+    "rounding_median",
+    "rounding_final",
     "min_det_F",
     "negative_modes",
     "off_rel",
     "tau",
 )
-_HEADER = ("case", "loaded", "unloaded", "steps", "residual", "min det F", "unstable", "off", "tau", "")
+SHAPES = ("median", "final")
+_HEADER = ("case", "loaded", "unloaded", "steps", "residual", "rounding", "min det F", "unstable", "off", "tau", "")
 
 
 def stress_csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
@@ -40,13 +43,14 @@ def stress_lines(rows: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def _words(row: Mapping[str, str]) -> tuple[str, ...]:
-    residual = max(float(row["residual_median"]), float(row["residual_final"]))
+    residual, rounding = (max(float(row[f"{what}_{shape}"]) for shape in SHAPES) for what in ("residual", "rounding"))
     return (
         row["case"],
         f"{100 * float(row['loaded']):.3g} %",
         f"{100 * float(row['unloaded']):.3g} %",
         row["load_steps"],
         f"{residual:.1e}",
+        f"{rounding:.1e}",
         f"{float(row['min_det_F']):.3g}",
         row["negative_modes"] or "-",
         f"{float(row['off_rel']):.1e}",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_sensitivity import CARD, scaled_inputs
 
+from fab4d.design.forward import Balance
 from fab4d.errors import SceneError
 from fab4d.io.csvtable import read_csv
 from fab4d.report.stress import COLUMNS
@@ -71,9 +72,20 @@ def test_bulk_moduli_keep_the_volume(inputs: dict[str, Any]) -> None:
     assert 1 - least[2] < 0.25 * (1 - least[0])
 
 
-def test_what_is_not_solved_is_told(inputs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("rounding", "solved"), [(0.0, False), (1.0, True)])
+def test_a_residual_above_the_limit_is_solved_only_if_it_is_rounding(
+    inputs: dict[str, Any], monkeypatch: pytest.MonkeyPatch, rounding: float, solved: bool
+) -> None:
     monkeypatch.setattr(stress, "SOLVED", 0.0)
-    assert not row(inputs, CASES[0])["solved"]
+    monkeypatch.setattr(stress, "_rounding", lambda *_: Balance(rounding, rounding, 1.0))
+    assert row(inputs, CASES[0])["solved"] == solved
+
+
+def test_rounding_leaves_more_of_what_is_stiff_and_far_away(inputs: dict[str, Any]) -> None:
+    usual, stiff, away = (row(inputs, case) for case in (CASES[0], Case("", {"glassy": 1e3}), Case("", away=1e3)))
+    assert stiff["rounding_final"] > 100 * usual["rounding_final"]
+    assert away["rounding_median"] > 100 * usual["rounding_median"]
+    assert usual["rounding_final"] < 1e-10
 
 
 def test_a_table_of_all_cases_and_the_largest_residual_of_those_solved(inputs: dict[str, Any]) -> None:
