@@ -43,18 +43,16 @@ class Rounding:
 
     relax_iterations : steps of relaxing at most
     most_left : share of all tets, at most, that is decided by and by
-    worst_rms : a relaxed design with a larger RMS error, L0, is not rounded
     """
 
     relax_iterations: int
     most_left: float
-    worst_rms: float = np.inf
 
 
 # The design is near already.
 OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE)
 # Where other elements have been searched themselves, steps are hard because of them.
-SEARCHED = Rounding(relax_iterations=0, most_left=1.0)
+SEARCHED_LEFT = 1.0
 # The design is farther from its best on a finer mesh than in other elements of the same one.
 FINER_MESH = Rounding(relax_iterations=8, most_left=LAST_SHARE)
 # A median shape is clear of unstable states where each mode keeps this share of its stiffness. One that has lost it
@@ -98,50 +96,78 @@ def carried_in(problem: Problem, relaxed: Search) -> Search | None:
     return None if start is None else replace(relaxed, equilibria=equilibria, design=start)
 
 
-def rounded_from(
-    carried: Search, settings: ReducedSettings, watch: Watch, how: Rounding = OTHER_ELEMENTS
-) -> Search | None:
+@dataclass(frozen=True, eq=False)
+class Relaxed:
+    """A relaxed design and the settings to round it with.
+
+    clear : whether it came near unstable states, and was relaxed further clear of them
+    """
+
+    at: Search
+    settings: ReducedSettings
+    clear: bool = False
+
+
+def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
     """A near 0/1 design from a relaxed one that was carried over from another discretisation.
 
     watch : is shown the phase and the state after each step
-    None where no equilibria lead to 0 and 1, or the relaxed design is none to round.
+    None where no equilibria lead to 0 and 1.
     """
+    return rounded_on(relaxed_from(carried, settings, watch, how.relax_iterations), watch, how.most_left)
+
+
+def relaxed_from(carried: Search, settings: ReducedSettings, watch: Watch, iterations: int) -> Relaxed:
+    """A design that was carried over, relaxed further.
+
+    iterations : of relaxing at most
+    Where that comes near unstable states, it goes on clear of them. Where it ends not far from there, rounding keeps
+    clear of them.
+    """
+    settings = replace(settings, relax_iterations=iterations, nearly=1.0)
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    return rounded_on(at, replace(settings, relax_iterations=how.relax_iterations, nearly=1.0), watch, how)
+    at = _relaxed_further(at, settings, watch)
+    ratio = _least_ratio(at)
+    if ratio < SOFT:
+        settings = replace(settings, weights=kept_clear(settings.weights))
+    clear = ratio < LEAST_STABLE
+    if clear:
+        at = _relaxed_further(replace(at, phase=Phase.RELAX, iteration=0, slow=0), settings, watch)
+    return Relaxed(at, settings, clear)
 
 
-def rounded_on(at: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:
-    """As `rounded_from`, from any state of a search in the elements of the result.
+def _relaxed_further(at: Search, settings: ReducedSettings, watch: Watch) -> Search:
+    L = smoothness_matrix(at.equilibria.problem)
+    while at.phase is Phase.RELAX:
+        at = STEPS[Phase.RELAX](replace(at, accepted=True), settings, L)
+        watch(Phase.RELAX.value, at)
+    return at
 
-    Where relaxing comes near unstable states, it goes on clear of them, and tets are decided by and by at once. Where
-    it ends not far from there, rounding keeps clear of them.
+
+def rounded_on(relaxed: Relaxed, watch: Watch, most_left: float) -> Search | None:
+    """A near 0/1 design from a relaxed one in the same elements; None where no equilibria lead to 0 and 1.
+
+    most_left : share of all tets, at most, that is decided by and by: at once where it is clear of unstable states, or
+        else where steps are hard
     """
-    settings = replace(settings, round_growth=ROUND_GROWTH)
-    L, hard, held_back, tried = smoothness_matrix(at.equilibria.problem), 0, 0, False
-    while at.phase is not Phase.DONE:
-        before, at = at, STEPS[at.phase](replace(at, accepted=True), settings, L)
-        watch(before.phase.value, at)
-        relaxed = before.phase is Phase.RELAX and at.phase is Phase.ROUND
-        clear = settings.weights.lam_stable > 0
-        ratio = _least_ratio(at) if relaxed and not clear else np.inf
-        if ratio < SOFT:
-            settings = replace(settings, weights=kept_clear(settings.weights))
-        if ratio < LEAST_STABLE:
-            at = replace(at, phase=Phase.RELAX, iteration=0, slow=0)
-            continue
-        if relaxed and at.relaxed_rms > how.worst_rms:
-            return None
-        left, all_left = (undecided_fraction(each.design.rho) for each in (at, before))
-        hard = hard + 1 if before.phase is Phase.ROUND and _is_hard(at) else 0
-        held_back = held_back + 1 if hard and not (at.accepted and left <= LITTLE_DECIDED * all_left) else 0
-        if not tried and (hard >= HARD_STEPS or (clear and relaxed)) and left <= how.most_left:
+    at, settings = relaxed.at, replace(relaxed.settings, round_growth=ROUND_GROWTH)
+    L, hard, held_back, by_and_by, tried = smoothness_matrix(at.equilibria.problem), 0, 0, relaxed.clear, False
+    while True:
+        left = undecided_fraction(at.design.rho)
+        if by_and_by and not tried and left <= most_left:
             found, tried = decided_by_and_by(at, settings, partial(watch, Phase.ROUND.value)), True
             if found is not None:
                 return found
-        if held_back == MOST_HELD_BACK:
+        if at.phase is Phase.DONE or held_back == MOST_HELD_BACK:
             break
-    return decided(at, settings, how.most_left)
+        at = STEPS[Phase.ROUND](replace(at, accepted=True), settings, L)
+        watch(Phase.ROUND.value, at)
+        decided_much = at.accepted and undecided_fraction(at.design.rho) <= LITTLE_DECIDED * left
+        hard = hard + 1 if _is_hard(at) else 0
+        held_back = held_back + 1 if hard and not decided_much else 0
+        by_and_by = hard >= HARD_STEPS
+    return decided(at, settings, most_left)
 
 
 def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:

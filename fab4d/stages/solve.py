@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import OTHER_ELEMENTS, SEARCHED, carried_in, rounded_from, rounded_on
+from fab4d.design.finish import OTHER_ELEMENTS, SEARCHED_LEFT, Relaxed, carried_in, relaxed_from, rounded_on
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
 from fab4d.design.problem import Problem
@@ -255,19 +255,15 @@ def _rounded_in(carried: Search, linear_rms: float, settings: ReducedSettings, t
 
     linear_rms : RMS error, L0, of the relaxed design in linear elements        None where no equilibria lead to one
     """
-    tolerance, reached = settings.weights.error_scale, carried
-    worst = max(LOST * linear_rms, LOST_SHARE * tolerance)
-
-    def watch(phase: str, at: Search) -> None:
-        nonlocal reached
-        reached = at
-        trace.add(phase, at)
-
-    rounded = rounded_from(carried, settings, watch, replace(OTHER_ELEMENTS, worst_rms=worst))
-    lost = reached.relaxed_rms > worst
+    tolerance = settings.weights.error_scale
+    further = relaxed_from(carried, settings, trace.add, OTHER_ELEMENTS.relax_iterations)
+    lost = further.at.relaxed_rms > max(LOST * linear_rms, LOST_SHARE * tolerance)
+    rounded = None if lost else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     if rounded is None and _rms(carried) > tolerance:
         rounded = _found_in(carried.equilibria.problem, settings, trace)
-    return rounded_from(carried, settings, trace.add) if rounded is None and lost else rounded
+    if rounded is None and lost:
+        rounded = rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
+    return rounded
 
 
 def _found_in(problem: Problem, settings: ReducedSettings, trace: Trace) -> Search | None:
@@ -289,7 +285,7 @@ def _found_in(problem: Problem, settings: ReducedSettings, trace: Trace) -> Sear
         return None
     if at.relaxed_rms > settings.weights.error_scale:
         return None
-    return rounded_on(at, settings, trace.add, SEARCHED)
+    return rounded_on(Relaxed(at, settings), trace.add, SEARCHED_LEFT)
 
 
 def _picked(

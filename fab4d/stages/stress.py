@@ -11,6 +11,7 @@ import numpy as np
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import Balance, Programming, balance, program
 from fab4d.design.objective import shape_error
+from fab4d.design.robustness import PHASES
 from fab4d.errors import SceneError
 from fab4d.materials.cards import MaterialCard, Moduli
 from fab4d.mesh.measures import bounding_box_diagonal
@@ -20,7 +21,6 @@ from fab4d.stages._design import patches_of, tau_seconds
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import Monitor
 
-PHASES = ("tpe", "rubbery", "glassy")
 POSITIONS = ("X", "X_temp", "x", "y")
 # Largest unbalanced nodal force, over the largest force of a point, of a shape that counts as solved; or what a change
 # of all positions in their last bit does to it, if that is more: no solver gets below that.
@@ -73,13 +73,18 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     smp = inputs["labels"]["smp"].astype(np.float64)
     monitor.progress("compile, measure tau")
     tau_s = tau_seconds(problem_like(mesh, materials, state["x"]))
-    rows = []
-    for number, case in enumerate(CASES):
-        kept = monitor.restore(f"case-{number}")
+
+    def made(number: int, case: Case) -> Row:
+        name = f"case-{number}"
+        kept = monitor.restore(name)
+        if kept is not None:
+            return dict(json.loads(str(kept["row"])))
         monitor.progress(case.name)
-        row = json.loads(str(kept["row"])) if kept else row_of(case, mesh, state, smp, materials, tau_s)
-        monitor.save(f"case-{number}", {"row": np.array(json.dumps(row))})
-        rows.append(row)
+        row = row_of(case, mesh, state, smp, materials, tau_s)
+        monitor.save(name, {"row": np.array(json.dumps(row))})
+        return row
+
+    rows = [made(number, case) for number, case in enumerate(CASES)]
     largest = max((max(row["residual_median"], row["residual_final"]) for row in rows if row["solved"]), default=None)
     report = {"tau_s": tau_s, "cases": len(rows), "solved": sum(row["solved"] for row in rows)}
     return {"stress_csv": stress_csv(rows), "stress_report": report | {"largest_residual": largest}}

@@ -12,6 +12,7 @@ from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.gauss_newton import Design
 from fab4d.design.patches import build_patches, spread_centers
 from fab4d.design.robustness import Instability
+from fab4d.design.stability import SoftModes
 from fab4d.io.cards import load_material
 from fab4d.materials.cards import Moduli
 from fab4d.mesh.distance import shape_error
@@ -183,6 +184,11 @@ def test_the_softest_mode_is_told_with_its_place(inputs: dict[str, Any], report:
     shape[free] = shapes[:, 0]
     node = np.linalg.norm(shape.reshape(-1, 3), axis=1).argmax()
     np.testing.assert_allclose(softest["at_mm"], mesh["X"][node], atol=1e-9)
+
+
+def test_without_a_mode_none_is_told(inputs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensitivity, "soft_modes", lambda *_: SoftModes(np.zeros(0), np.zeros((0, 1, 3))))
+    assert measured(inputs)["softest"] is None
 
 
 def test_what_cannot_be_measured_is_left_out(inputs: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from bent_bar import PROFILE, bent_bar
 from shapes.boxes import box
 
 from fab4d.design import reduced
-from fab4d.design.finish import OTHER_ELEMENTS, Rounding, carried_in
+from fab4d.design.finish import Relaxed, carried_in
 from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import ReducedSettings, Search, at_rest, undecided_fraction
@@ -136,12 +136,13 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
 ) -> None:
     """Where quadratic tets need more SMP than the goal allows, the labels of the linear ones are handed on."""
 
-    def all_smp(carried: Search, *_: Any) -> Search:
-        problem = carried.equilibria.problem
+    def all_smp(relaxed: Relaxed, *_: Any) -> Search:
+        problem = relaxed.at.equilibria.problem
         rest = at_rest(problem)
-        return replace(rest, design=replace(rest.design, rho=np.ones(problem.n_tets)), relaxed_rms=carried.relaxed_rms)
+        density = replace(rest.design, rho=np.ones(problem.n_tets))
+        return replace(rest, design=density, relaxed_rms=relaxed.at.relaxed_rms)
 
-    monkeypatch.setattr(solve, "rounded_from", all_smp)
+    monkeypatch.setattr(solve, "rounded_on", all_smp)
     monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     monkeypatch.setattr(solve, "_prints_better", lambda *_: False)
     for most, kept in ((None, True), (0.9, False)):
@@ -166,7 +167,7 @@ def test_linear_elements_round_what_quadratic_ones_lose(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = []
-    monkeypatch.setattr(solve, "rounded_from", lambda *_: tried.append(1))
+    monkeypatch.setattr(solve, "rounded_on", lambda *_: tried.append(1))
     monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
     assert len(tried) == 1
@@ -199,43 +200,54 @@ def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_
     asked: list[Problem] = []
     monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     monkeypatch.setattr(solve, "far_off", lambda *_: False)
-    monkeypatch.setattr(solve, "rounded_from", lambda *_: None)
+    monkeypatch.setattr(solve, "rounded_on", lambda *_: None)
     monkeypatch.setattr(solve, "_found_in", lambda problem, *_: asked.append(problem))
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
     solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
     assert [problem.body.order for problem in asked] == [2] * searched
 
 
-@pytest.mark.parametrize("found_there", [True, False])
+@pytest.mark.parametrize(
+    ("lost", "found_there", "steps"),
+    [
+        (0.99, True, ["relaxed", "rounded"]),
+        (1.01, True, ["relaxed", "searched"]),
+        (1.01, False, ["relaxed", "searched", "rounded"]),
+    ],
+)
 def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_no_other(
     relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings],
     monkeypatch: pytest.MonkeyPatch,
+    lost: float,
     found_there: bool,
+    steps: list[str],
 ) -> None:
+    """lost : error of the design relaxed in quadratic elements, in the largest that is no loss"""
     bar, found, settings = relaxed_bar
+    settings = replace(settings, weights=settings.weights.replace(error_scale=0.5 * found.relaxed_rms))
     done = list[str]()
-    tolerance = 0.5 * found.relaxed_rms
-    settings = replace(settings, weights=settings.weights.replace(error_scale=tolerance))
 
-    def rounding(carried: Search, _: ReducedSettings, watch: Any, how: Rounding = OTHER_ELEMENTS) -> Search | None:
-        done.append("rounded" if how.worst_rms == np.inf else "judged")
-        assert how.worst_rms in {solve.LOST * found.relaxed_rms, np.inf}
-        at = replace(carried, relaxed_rms=1.01 * solve.LOST * found.relaxed_rms)
-        watch("relax", at)
-        return at if how.worst_rms == np.inf else None
+    def relaxing(carried: Search, settings: ReducedSettings, *_: Any) -> Relaxed:
+        done.append("relaxed")
+        return Relaxed(replace(carried, relaxed_rms=lost * solve.LOST * found.relaxed_rms), settings)
+
+    def rounding(relaxed: Relaxed, *_: Any) -> Search:
+        done.append("rounded")
+        return relaxed.at
 
     def searching(*_: Any) -> Search | None:
         done.append("searched")
         return found if found_there else None
 
-    for name, value in (("rounded_from", rounding), ("_found_in", searching), ("far_off", lambda *_: False)):
+    for name, value in (("relaxed_from", relaxing), ("rounded_on", rounding), ("_found_in", searching)):
         monkeypatch.setattr(solve, name, value)
+    monkeypatch.setattr(solve, "far_off", lambda *_: False)
     monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
     finish = solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
     assert finish.found is not None
-    assert (finish.found is found) == found_there
-    assert done == ["judged", "searched", *([] if found_there else ["rounded"])]
+    assert (finish.found is found) == (done[-1] == "searched")
+    assert done == steps
 
 
 @pytest.mark.parametrize(("tolerance", "reached"), [(1.0, True), (1e-6, False)])

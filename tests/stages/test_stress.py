@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from test_sensitivity import CARD, scaled_inputs
 
-from fab4d.design.forward import Balance
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.forward import Balance, program
 from fab4d.errors import SceneError
 from fab4d.io.csvtable import read_csv
 from fab4d.report.stress import COLUMNS
 from fab4d.stages import stress
+from fab4d.stages._design import patches_of, problem_of
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.stress import CASES, Case, row_of
 
@@ -86,6 +88,18 @@ def test_rounding_leaves_more_of_what_is_stiff_and_far_away(inputs: dict[str, An
     assert stiff["rounding_final"] > 100 * usual["rounding_final"]
     assert away["rounding_median"] > 100 * usual["rounding_median"]
     assert usual["rounding_final"] < 1e-10
+
+
+def test_a_singular_tangent_has_no_number_of_unstable_ways(
+    inputs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_of(inputs["mesh"], CARD, "linear")
+    equilibria = Equilibria(problem, patches_of(problem, inputs["state"]))
+    smp, x = inputs["labels"]["smp"].astype(np.float64), inputs["state"]["x"] / problem.length
+    done = program(equilibria, smp, x, inputs["state"]["patch_force"] / problem.force)
+    assert stress._negative_modes(equilibria, smp, done) == 0
+    monkeypatch.setattr(Equilibria, "median_tangent", lambda *_: np.zeros(equilibria.held_pattern.nnz))
+    assert stress._negative_modes(equilibria, smp, done) is None
 
 
 def test_a_table_of_all_cases_and_the_largest_residual_of_those_solved(inputs: dict[str, Any]) -> None:
