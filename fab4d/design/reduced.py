@@ -121,6 +121,11 @@ class Search:
     relaxed_rms: float = np.inf
     stay: bool = True
 
+    @property
+    def rms(self) -> float:
+        """RMS error of the design, L0."""
+        return shape_error(self.equilibria.problem, self.design.final.y).rms
+
 
 Watch = Callable[[Search], None]
 
@@ -292,7 +297,7 @@ def exchange_step(at: Search, settings: ReducedSettings, L: csr_array) -> Search
     """Hold other points where that promises a lower objective and keeps it; relaxing goes on with either."""
     weights = settings.weights.replace(lam_SMP=at.lam_SMP)
     done = replace(at, phase=Phase.RELAX, exchanges=EXCHANGED, slow=0)
-    if shape_error(at.equilibria.problem, at.design.final.y).rms <= GOOD_ENOUGH * weights.error_scale:
+    if at.rms <= GOOD_ENOUGH * weights.error_scale:
         return done
     model, value = build_model(at.equilibria, weights, L, at.design), evaluate(at.equilibria, weights, L, at.design)
     for equilibria, moved in exchanged(at.equilibria, weights, model, at.design, at.patch_radius):

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 from fab4d.design.finish import FINER_MESH, rounded_from
 from fab4d.design.levels import Level, carried_up
-from fab4d.design.objective import shape_error
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search
 from fab4d.io.scene import Goal
@@ -70,7 +69,7 @@ def _one_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, ad
     rounded = None
     if at.relaxed is not None and not far_off(at.relaxed, settings):
         rounded = _rounded(carried_up(level, at.relaxed), settings, goal, add)
-    if rounded is not None and _rms(rounded.found) <= settings.weights.error_scale:
+    if rounded is not None and rounded.found.rms <= settings.weights.error_scale:
         return rounded
     return _better(rounded, _carried(level, at.found, add))
 
@@ -78,7 +77,7 @@ def _one_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, ad
 def _farther_up(level: Level, at: _Design, settings: ReducedSettings, goal: Goal, add: Add) -> _Design | None:
     """The design on a mesh that is finer still, as it is carried over, or rounded there where that is worth it."""
     carried, tolerance = _carried(level, at.found, add), settings.weights.error_scale
-    if carried is None or _rms(carried.found) <= WON_BY_FIT * tolerance or _rms(at.found) > OUT_OF_REACH * tolerance:
+    if carried is None or carried.found.rms <= WON_BY_FIT * tolerance or at.found.rms > OUT_OF_REACH * tolerance:
         return carried
     start = carried.found if at.relaxed is None else carried_up(level, at.relaxed)
     return _better(_rounded(start, settings, goal, add), carried)
@@ -109,8 +108,4 @@ def _rounded(start: Search | None, settings: ReducedSettings, goal: Goal, add: A
 
 
 def _better(one: _Design | None, other: _Design | None) -> _Design | None:
-    return min((each for each in (one, other) if each is not None), key=lambda each: _rms(each.found), default=None)
-
-
-def _rms(at: Search) -> float:
-    return shape_error(at.equilibria.problem, at.design.final.y).rms
+    return min((each for each in (one, other) if each is not None), key=lambda each: each.found.rms, default=None)

@@ -17,8 +17,8 @@ from fab4d.report.tradeoff import tradeoff_csv, tradeoff_plot
 from fab4d.stages._design import Trace, problem_of, tau_seconds
 from fab4d.stages._printed import Printed, as_printed, faults, smp_share
 from fab4d.stages._search import search_arrays, search_from
+from fab4d.stages._settings import search_settings
 from fab4d.stages.monitor import Monitor
-from fab4d.stages.solve import search_settings
 
 # Multiples of the usual price of SMP.
 PRICES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)

@@ -17,12 +17,13 @@ from fab4d.design.reduced import ReducedSettings, Search, at_rest, undecided_fra
 from fab4d.fabrication.labels import ambiguous_fraction
 from fab4d.io.scene import Acceptance, Goal, SolverSettings
 from fab4d.report.metrics import shapes_of
-from fab4d.stages import _bring_up, _coarse, solve
+from fab4d.stages import _attempts, _bring_up, _coarse, _finish, _limits, _settings, solve
 from fab4d.stages._design import Trace, problem_of
 from fab4d.stages._figures import limits_of
 from fab4d.stages._printed import Printed
+from fab4d.stages._settings import search_settings
 from fab4d.stages.monitor import SilentMonitor
-from fab4d.stages.solve import run, search_settings
+from fab4d.stages.solve import run
 
 QUADRATIC = SolverSettings(element="quadratic")
 
@@ -83,7 +84,7 @@ def test_more_points_are_advised_only_where_they_are_enough(
     bar: dict[str, np.ndarray], reached: float, enough: bool
 ) -> None:
     problem = problem_of(bar, PROFILE["materials"], "linear")
-    said = solve._outlook(problem, 0.01, solve._MorePoints(8, 0.01 * reached))
+    said = _limits._outlook(problem, 0.01, _limits.MorePoints(8, 0.01 * reached))
     assert "8 points would leave" in said
     assert ("change it or the tolerance" not in said) == enough
 
@@ -105,8 +106,8 @@ def test_a_design_is_limited_where_it_misses_the_tolerance_relaxed_and_rounded(
     mesh = bar | {"X_temp": bar["X"] + moved * (bar["X_temp"] - bar["X"])}
     problem, profile = problem_of(mesh, PROFILE["materials"], "linear"), PROFILE | {"goal": Goal(0.6, 3)}
     found = replace(at_rest(problem), relaxed_rms=relaxed_rms)
-    assert solve._hopeless(profile, search_settings(problem, profile), found) == limited
-    assert (solve._limited_by(problem, profile, found) is not None) == limited
+    assert _attempts._hopeless(profile, search_settings(problem, profile), found) == limited
+    assert (_limits.limited_by(problem, profile, found) is not None) == limited
 
 
 @pytest.mark.parametrize("share", [1.0, 0.1])
@@ -124,7 +125,7 @@ def test_very_fine_meshes_are_rounded_in_fewer_steps(
 ) -> None:
     problem, profile = problem_of(bar, PROFILE["materials"], "linear"), PROFILE | {"goal": Goal(max_forces=3)}
     usual = search_settings(problem, profile)
-    monkeypatch.setattr(solve, "MANY_TETS", problem.n_tets - 1)
+    monkeypatch.setattr(_settings, "MANY_TETS", problem.n_tets - 1)
     fast = search_settings(problem, profile)
     assert fast.round_growth > 2 > usual.round_growth
     assert usual.nearly > fast.nearly == 1.0
@@ -142,9 +143,9 @@ def test_labels_of_other_elements_keep_to_the_share_of_smp_or_are_left(
         density = replace(rest.design, rho=np.ones(problem.n_tets))
         return replace(rest, design=density, relaxed_rms=relaxed.at.relaxed_rms)
 
-    monkeypatch.setattr(solve, "rounded_on", all_smp)
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
-    monkeypatch.setattr(solve, "_prints_better", lambda *_: False)
+    monkeypatch.setattr(_finish, "rounded_on", all_smp)
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(_attempts, "_prints_better", lambda *_: False)
     for most, kept in ((None, True), (0.9, False)):
         found = solved(bar, Goal(tolerance=0.6, max_forces=3, max_smp_fraction=most), solver=QUADRATIC)["relaxed"]
         assert (len(found["x"]) > len(bar["X"])) == kept
@@ -157,7 +158,7 @@ def phases(found: dict[str, Any]) -> list[bytes]:
 def test_nothing_is_rounded_in_linear_elements_where_quadratic_ones_do_it_well() -> None:
     bar = bent_bar((9, 2, 2), 50.0)
     found = solved(bar, Goal(tolerance=1.0, max_forces=3), solver=QUADRATIC)
-    assert solve.NOT_LINEAR in found["solve_report"]["left_out"]
+    assert _finish.NOT_LINEAR in found["solve_report"]["left_out"]
     assert b"round" not in phases(found)[: phases(found).index(b"carried over")]
     assert phases(found).count(b"carried over") == 1
     assert len(found["relaxed"]["x"]) > len(bar["X"])
@@ -167,12 +168,12 @@ def test_linear_elements_round_what_quadratic_ones_lose(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried = []
-    monkeypatch.setattr(solve, "rounded_on", lambda *_: tried.append(1))
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(_finish, "rounded_on", lambda *_: tried.append(1))
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
     found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
     assert len(tried) == 1
     assert len(found["relaxed"]["x"]) == len(bar["X"])
-    assert solve.NOT_LINEAR not in found["solve_report"]["left_out"]
+    assert _finish.NOT_LINEAR not in found["solve_report"]["left_out"]
     assert found["solve_report"]["printed_rms_mm"] <= 1.5
 
 
@@ -196,14 +197,14 @@ def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_
     bar, found, settings = relaxed_bar
     carried = carried_in(problem_of(bar, PROFILE["materials"], "quadratic"), found)
     assert carried is not None
-    settings = replace(settings, weights=settings.weights.replace(error_scale=share * solve._rms(carried)))
+    settings = replace(settings, weights=settings.weights.replace(error_scale=share * carried.rms))
     asked: list[Problem] = []
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
-    monkeypatch.setattr(solve, "far_off", lambda *_: False)
-    monkeypatch.setattr(solve, "rounded_on", lambda *_: None)
-    monkeypatch.setattr(solve, "_found_in", lambda problem, *_: asked.append(problem))
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
+    monkeypatch.setattr(_finish, "far_off", lambda *_: False)
+    monkeypatch.setattr(_finish, "rounded_on", lambda *_: None)
+    monkeypatch.setattr(_finish, "_found_in", lambda problem, *_: asked.append(problem))
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
-    solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
+    _finish.finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
     assert [problem.body.order for problem in asked] == [2] * searched
 
 
@@ -229,7 +230,7 @@ def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_
 
     def relaxing(carried: Search, settings: ReducedSettings, *_: Any) -> Relaxed:
         done.append("relaxed")
-        return Relaxed(replace(carried, relaxed_rms=lost * solve.LOST * found.relaxed_rms), settings)
+        return Relaxed(replace(carried, relaxed_rms=lost * _finish.LOST * found.relaxed_rms), settings)
 
     def rounding(relaxed: Relaxed, *_: Any) -> Search:
         done.append("rounded")
@@ -240,11 +241,11 @@ def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_
         return found if found_there else None
 
     for name, value in (("relaxed_from", relaxing), ("rounded_on", rounding), ("_found_in", searching)):
-        monkeypatch.setattr(solve, name, value)
-    monkeypatch.setattr(solve, "far_off", lambda *_: False)
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
+        monkeypatch.setattr(_finish, name, value)
+    monkeypatch.setattr(_finish, "far_off", lambda *_: False)
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
-    finish = solve._finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
+    finish = _finish.finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
     assert finish.found is not None
     assert (finish.found is found) == (done[-1] == "searched")
     assert done == steps
@@ -257,14 +258,14 @@ def test_a_search_in_quadratic_elements_ends_in_labels_or_where_the_relaxed_desi
     bar, profile = relaxed_bar[0], PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=3)}
     problem = problem_of(bar, PROFILE["materials"], "quadratic")
     settings, trace = search_settings(problem, profile), trace_of(problem, bar)
-    found = solve._found_in(problem, settings, trace)
+    found = _finish._found_in(problem, settings, trace)
     assert (found is not None) == reached
     shown = [row["phase"] for row in trace.rows]
     assert shown[:2] == ["start", "relax"]
     assert ("round" in shown) == reached
     if found is not None:
         assert ambiguous_fraction(found.design.rho) < 1e-3
-        assert solve._rms(found) <= settings.weights.error_scale
+        assert found.rms <= settings.weights.error_scale
 
 
 def trace_of(problem: Problem, mesh: dict[str, np.ndarray]) -> Trace:
@@ -281,18 +282,19 @@ def test_the_design_that_prints_better_is_delivered(
     """Errors as printed in shares of the tolerance; linear elements are tried where quadratic ones miss it."""
     bar, goal = bent_bar((9, 2, 2), 50.0), Goal(tolerance=1.5, max_forces=3)
     tolerance = goal.tolerance / float(np.linalg.norm(np.ptp(bar["X"], axis=0)))
-    as_printed = solve.as_printed
+    as_printed = _finish.as_printed
 
     def printed(problem: Problem, *given: Any, **named: Any) -> Printed:
         found = as_printed(problem, *given, **named)
         return found if problem.body.order == 1 else replace(found, rms=quadratic_rms * tolerance)
 
-    monkeypatch.setattr(solve, "as_printed", printed)
-    monkeypatch.setattr(solve, "refitted_in", lambda *_: linear_rms * tolerance)
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 0.0)
-    monkeypatch.setattr(solve, "CERTAINLY_ENOUGH", 0.0)
+    monkeypatch.setattr(_finish, "as_printed", printed)
+    monkeypatch.setattr(_attempts, "refitted_in", lambda *_: linear_rms * tolerance)
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
+    for module in (_finish, _attempts):
+        monkeypatch.setattr(module, "CERTAINLY_ENOUGH", 0.0)
     found = solved(bar, goal, solver=QUADRATIC)
-    assert (solve.NOT_LINEAR not in found["solve_report"]["left_out"]) == tried
+    assert (_finish.NOT_LINEAR not in found["solve_report"]["left_out"]) == tried
     assert (len(found["relaxed"]["x"]) > len(bar["X"])) == (delivered == "quadratic")
 
 
@@ -308,19 +310,19 @@ def test_an_error_in_the_elements_of_the_fit_is_not_found_twice(
         calls.append(given)
         return 0.1
 
-    monkeypatch.setattr(solve, "refitted_in", refitted)
-    better = solve._prints_better(best, solve._Linear(best.design, 0.2, in_fit), problem, 0.2, settings)
+    monkeypatch.setattr(_attempts, "refitted_in", refitted)
+    better = _attempts._prints_better(best, _attempts._Linear(best.design, 0.2, in_fit), problem, 0.2, settings)
     assert better == (in_fit != 0.3)
     assert len(calls) == asked
-    assert not solve._prints_better(best, solve._Linear(None, np.inf), problem, 0.2, settings)
+    assert not _attempts._prints_better(best, _attempts._Linear(None, np.inf), problem, 0.2, settings)
 
 
 def test_quadratic_elements_do_not_round_what_they_see_as_linear_ones_do(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 100.0)
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 100.0)
     found = solved(bar, Goal(tolerance=1.5, max_forces=3), solver=QUADRATIC)
-    assert solve.LINEAR_ROUNDS in found["solve_report"]["left_out"]
+    assert _finish.LINEAR_ROUNDS in found["solve_report"]["left_out"]
     assert phases(found).count(b"carried over") == 1
     assert phases(found)[phases(found).index(b"carried over") + 1] == b"round"
     assert len(found["relaxed"]["x"]) == len(bar["X"])
@@ -331,16 +333,16 @@ def test_labels_that_other_elements_do_not_hold_are_designed_again(
     bar: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch, element: str
 ) -> None:
     """Where these are those of the last fit, and miss the tolerance by more than flips win back."""
-    monkeypatch.setattr(solve, "LINEAR_HOLDS", 100.0)
+    monkeypatch.setattr(_finish, "LINEAR_HOLDS", 100.0)
     left, asked = [0.0], list[float]()
 
     def refitted(*_: Any) -> float:
         asked.append(left[0])
         return left[0]
 
-    monkeypatch.setattr(solve, "refitted_in", refitted)
+    monkeypatch.setattr(_attempts, "refitted_in", refitted)
     solver = SolverSettings(element=element)
-    for share, attempts in ((1.4, 1), (1.6, len(solve.ATTEMPTS))):
+    for share, attempts in ((1.4, 1), (1.6, len(_settings.ATTEMPTS))):
         asked.clear()
         goal = Goal(tolerance=1.5, max_forces=3)
         left[0] = share * goal.tolerance / float(np.linalg.norm(np.ptp(bar["X"], axis=0)))
@@ -351,10 +353,10 @@ def test_labels_that_other_elements_do_not_hold_are_designed_again(
 
 def test_a_goal_far_out_of_reach_is_not_rounded_in_quadratic_elements(bar: dict[str, np.ndarray]) -> None:
     found = solved(bar, Goal(tolerance=0.01, max_forces=1), solver=QUADRATIC)
-    assert solve.NOT_QUADRATIC in found["solve_report"]["left_out"]
+    assert _finish.NOT_QUADRATIC in found["solve_report"]["left_out"]
     assert b"carried over" not in phases(found)
     linear = solved(bar, Goal(tolerance=0.01, max_forces=1))
-    assert solve.NOT_QUADRATIC not in linear["solve_report"]["left_out"]
+    assert _finish.NOT_QUADRATIC not in linear["solve_report"]["left_out"]
 
 
 @pytest.fixture

@@ -19,9 +19,10 @@ from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal
 from fab4d.stages import _starts
 from fab4d.stages._design import Trace, problem_of
+from fab4d.stages._settings import search_settings
 from fab4d.stages._starts import Starts
 from fab4d.stages.monitor import SilentMonitor
-from fab4d.stages.solve import run, search_settings
+from fab4d.stages.solve import run
 
 MESH = bent_bar((7, 1, 1), 60.0)
 PROBLEM = problem_of(MESH, PROFILE["materials"], "linear")

@@ -18,6 +18,7 @@ from fab4d.stages import _printed, check, solve, threshold, tradeoff
 from fab4d.stages._design import problem_of
 from fab4d.stages._printed import as_printed, faults, refitted_in
 from fab4d.stages._search import search_from
+from fab4d.stages._settings import search_settings
 from fab4d.stages.monitor import SilentMonitor
 
 STRIP = Path(__file__).parents[2] / "samples" / "strip"
@@ -139,7 +140,7 @@ def judged(scene: Scene, checked: dict[str, Any], kept: Kept) -> tuple[Any, ...]
     """Problem, design and print of row 3x1, which is acceptable."""
     problem = problem_of(checked["mesh"], scene.materials, "linear")
     found = search_from(problem, kept[1].saved["3x1"])
-    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    weights = search_settings(problem, profile_of(scene, STUDY)).weights
     return problem, found, as_printed(problem, checked["mesh"], scene.printer, scene.goal, weights, found, np.inf)
 
 
@@ -149,7 +150,7 @@ def test_printed_labels_are_refitted_in_other_elements(
     """A fit is made where the tolerance is missed; in the same elements nothing changes."""
     problem, found, printed = judged
     quadratic = problem_of(checked["mesh"], scene.materials, "quadratic")
-    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    weights = search_settings(problem, profile_of(scene, STUDY)).weights
     same = refitted_in(problem, found, printed.design, weights.replace(error_scale=1.0))
     assert same == pytest.approx(printed.rms, rel=1e-3)
     carried = refitted_in(quadratic, found, printed.design, weights.replace(error_scale=1.0))
@@ -162,7 +163,7 @@ def test_flips_of_a_judged_design_end_where_it_is_good_enough(
     scene: Scene, checked: dict[str, Any], judged: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, found, printed = judged
-    weights = solve.search_settings(problem, profile_of(scene, STUDY)).weights
+    weights = search_settings(problem, profile_of(scene, STUDY)).weights
     asked = list[float]()
 
     def polished(_: Any, design: Any, __: Any, settings: Any, ___: Any) -> Any:
