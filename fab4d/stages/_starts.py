@@ -17,6 +17,7 @@ from fab4d.stages._search import search_arrays, search_from
 from fab4d.stages.monitor import Monitor
 
 FIRST, CENTERS = "first", "centers"
+NO_OTHERS = {CENTERS: np.zeros(0, np.int64)}
 # Other points may win some 10 %: they are not tried where the tolerance is missed by more than this factor.
 NEARLY = 1.5
 # Larger meshes are coarsened for it: there each beginning takes seconds, and what is better on them is so on all.
@@ -63,35 +64,40 @@ class Starts:
         if not np.array_equal(at.design.rho, first.design.rho):
             return self._lower(first, at, watch)
         if self.monitor.restore(CENTERS) is None:
-            self._keep(self._search(first.relaxed_rms))
-        centers = self.chosen()
-        if centers is None:
-            return first
-        other = relaxed(self.problem, replace(settings, centers=centers), watch)
-        return self._lower(first, other, watch)
+            self.monitor.save(CENTERS, self._search(first.relaxed_rms))
+        return first if self.chosen() is None else self._lower(first, self._from_chosen(settings, watch), watch)
+
+    def _from_chosen(self, settings: ReducedSettings, watch: Watch) -> Search:
+        """The relaxed design from the chosen points; where it was found on the same mesh, it is relaxed further."""
+        kept = self.monitor.restore(CENTERS)
+        assert kept is not None  # there are chosen points
+        start = None
+        if kept.keys() > {CENTERS}:
+            start = replace(search_from(self.problem, kept), phase=Phase.RELAX, iteration=0, slow=0)
+            watch(start)
+        return relaxed(self.problem, replace(settings, centers=kept[CENTERS]), watch, start)
 
     def _lower(self, first: Search, other: Search, watch: Watch) -> Search:
         if other.relaxed_rms < first.relaxed_rms:
             return other
-        self._keep(np.zeros(0, np.int64))
+        self.monitor.save(CENTERS, NO_OTHERS)
         # Shown again, without a row of its own: it is what the rest sets out from.
         watch(replace(first, accepted=False))
         return first
 
-    def _keep(self, centers: IntArray) -> None:
-        self.monitor.save(CENTERS, {CENTERS: centers})
+    def _search(self, usual: float) -> Mapping[str, np.ndarray]:
+        """The relaxed design that is lower than that of the usual points, which is at `usual`, as `search_arrays`.
 
-    def _search(self, usual: float) -> IntArray:
-        """Centers (K,) from which relaxing comes lower than from the usual ones, which is to `usual`; or none."""
+        Of one that was found on a coarser mesh, only its centers (K,); NO_OTHERS if there is none.
+        """
         problem, told, vertices = self.problem, self.trace, np.arange(len(self.mesh["X"]))
-        none = np.zeros(0, np.int64)
         large = problem.n_tets > LARGE_TETS
         if large:
             coarse = coarse_of(problem, self.mesh, self.materials, START_TETS)
             problem, vertices = coarse.level.coarse, coarse.level.vertices
             told = told.on(problem, coarse.mesh)
         if problem.n_tets > LARGE_TETS:
-            return none
+            return NO_OTHERS
         # Steps past unstable states are for the one that is taken.
         settings = replace(self.settings_of(problem), nearly=1.0)
 
@@ -102,11 +108,12 @@ class Starts:
             try:
                 usual = relaxed(problem, settings, watch).relaxed_rms
             except EquilibriumError:
-                return none
-        found, least = none, BETTER * usual
+                return NO_OTHERS
+        found, least = NO_OTHERS, BETTER * usual
         for at in beginnings(problem, settings, watch, self.most):
             if at.relaxed_rms < least:
-                found, least = vertices[at.equilibria.patches.centers], at.relaxed_rms
+                centers = {CENTERS: vertices[at.equilibria.patches.centers]}
+                found, least = centers if large else search_arrays(at), at.relaxed_rms
             if least <= WELL_BELOW * settings.weights.error_scale:
                 break
         return found

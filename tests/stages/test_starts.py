@@ -13,7 +13,7 @@ from bent_bar import PROFILE, bent_bar
 from fab4d.design import starts as starts_of_design
 from fab4d.design.patches import build_patches, pad_vertices
 from fab4d.design.problem import Problem
-from fab4d.design.reduced import ReducedSettings, Search, relaxed
+from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed
 from fab4d.design.starts import beginnings, crossed_centers, random_centers
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal
@@ -115,7 +115,7 @@ def test_other_points_are_looked_for_where_the_tolerance_is_nearly_met(
 ) -> None:
     first = replace(usual(0.3), relaxed_rms=0.3 / share / PROBLEM.length)
     looked = []
-    monkeypatch.setattr(Starts, "_search", lambda self, rms: looked.append(rms) or np.zeros(0, np.int64))  # noqa: ARG005
+    monkeypatch.setattr(Starts, "_search", lambda self, rms: looked.append(rms) or _starts.NO_OTHERS)  # noqa: ARG005
     assert starts(0.3, Keeping()).best(first, lambda at: None) is first  # noqa: ARG005
     assert bool(looked) is looked_for
 
@@ -148,7 +148,8 @@ def test_the_lowest_end_is_taken(
     first, looked = usual(0.85), list[int]()
     monkeypatch.setattr(_starts, "beginnings", begun_with(first, dict(zip(vertices.tolist(), ends)), looked))  # noqa: B905
     found = starts(0.85, Keeping())._search(0.97 / PROBLEM.length)
-    np.testing.assert_array_equal(found, [] if chosen is None else [vertices[chosen]])
+    np.testing.assert_array_equal(found["centers"], [] if chosen is None else [vertices[chosen]])
+    assert ("rho" in found) == (chosen is not None)
     assert len(looked) == seen
 
 
@@ -168,7 +169,9 @@ def test_on_a_coarser_mesh_the_points_are_vertices_of_the_whole_one(
     monkeypatch.setattr(_starts, "beginnings", begun_with(first, {vertex: 0.95}, seen))
     trace = Trace(problem, mesh, SilentMonitor(), 1.0)
     mine = Starts(problem, mesh, PROFILE["materials"], settings_of(0.3), trace, Keeping())
-    (found,) = mine._search(0.5 / problem.length)
+    found = mine._search(0.5 / problem.length)
+    assert found.keys() == {"centers"}
+    (found,) = found["centers"]
     np.testing.assert_allclose(mesh["X"][found], own.body.X[vertex] * own.length, atol=1e-12)
 
 
@@ -189,7 +192,7 @@ def test_the_usual_points_are_kept_where_a_coarser_mesh_tells_nothing(
     monkeypatch.setattr(_starts, "beginnings", lambda *_: looked.append(1) or [])
     trace = Trace(problem, mesh, SilentMonitor(), 1.0)
     mine = Starts(problem, mesh, PROFILE["materials"], settings_of(0.3), trace, Keeping())
-    assert len(mine._search(0.5 / problem.length)) == 0
+    assert mine._search(0.5 / problem.length) is _starts.NO_OTHERS
     assert not looked
 
 
@@ -200,6 +203,20 @@ def test_the_error_is_that_of_the_better_points(reached: float) -> None:
     best = mine.best(first, lambda at: None)  # noqa: ARG005
     assert best.equilibria.patches.count == 2
     assert (best is first) if mine.chosen() is None else (best.relaxed_rms < first.relaxed_rms)
+
+
+def test_the_design_that_was_found_with_other_points_is_relaxed_further(
+    reached: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Relaxing anew from the points that it ended with would come to another one."""
+    monkeypatch.setattr(_starts, "BETTER", 10.0)
+    tolerance, monitor, shown = 0.9 * reached, Keeping(), list[Search]()
+    best = starts(tolerance, monitor).best(usual(tolerance), shown.append)
+    found = monitor.kept[_starts.CENTERS]
+    np.testing.assert_array_equal(shown[0].design.rho, found["rho"])
+    assert shown[0].phase is Phase.RELAX
+    assert shown[1].phase in (Phase.RELAX, Phase.ROUND)
+    assert best.relaxed_rms <= 1.01 * shown[0].rms
 
 
 def test_a_stopped_run_goes_on_to_the_same_design(reached: float, monkeypatch: pytest.MonkeyPatch) -> None:
