@@ -88,3 +88,16 @@ def side_curvature(points: FloatArray, tets: IntArray) -> FloatArray:
 def largest_stretches(F: FloatArray) -> FloatArray:
     """Largest principal stretch (m,) of deformation gradients (m, 3, 3)."""
     return np.sqrt(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F)[:, -1])
+
+
+def smallest_surface_stretches(X: FloatArray, x: FloatArray, faces: IntArray) -> FloatArray:
+    """Smaller principal stretch (b,) of triangles (b, 3) in their plane, from vertices X to x (n, 3)."""
+    metrics = []
+    for vertices in (X, x):
+        sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+        metrics.append(sides @ np.swapaxes(sides, 1, 2))
+    C = np.linalg.solve(*metrics)
+    half, det = 0.5 * np.trace(C, axis1=1, axis2=2), np.linalg.det(C)
+    # The smaller root of l^2 - 2 half l + det, without cancellation.
+    larger = half + np.sqrt(np.maximum(half**2 - det, 0.0))
+    return np.sqrt(np.maximum(det, 0.0) / larger)

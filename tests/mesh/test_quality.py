@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fab4d.mesh.quality import (
     coincident_vertices,
@@ -12,6 +13,7 @@ from fab4d.mesh.quality import (
     non_manifold_vertices,
     overlapping_tets,
     side_curvature,
+    smallest_surface_stretches,
     vertex_components,
 )
 from fab4d.mesh.topology import face_table
@@ -77,3 +79,16 @@ def test_side_curvature_is_the_sag_of_a_mid_node() -> None:
 def test_largest_stretch_ignores_rotation() -> None:
     Q = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     assert largest_stretches((Q @ np.diag([0.5, 1.7, 1.2]))[None])[0] == pytest.approx(1.7)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_plane_stretch_of_a_surface_is_that_of_its_deformation(seed: int) -> None:
+    """Triangles of one plane, stretched in it by two known factors, then moved rigidly."""
+    random = np.random.default_rng(seed)
+    Q, R = Rotation.random(2, random).as_matrix()
+    flat = np.column_stack([random.normal(size=(9, 2)), np.zeros(9)])
+    factors = random.uniform(0.05, 3.0, 2)
+    x = (flat * [*factors, 1.0]) @ R.T + random.normal(size=3)
+    faces = np.arange(9).reshape(3, 3)
+    found = smallest_surface_stretches(flat @ Q, x, faces)
+    np.testing.assert_allclose(found, factors.min(), rtol=1e-7)

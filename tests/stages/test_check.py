@@ -468,6 +468,26 @@ def test_a_stretch_that_one_material_does_not_bear_is_told() -> None:
     assert {"stretch-tpe", "suggested-clamp"} == codes(report).keys()
 
 
+@pytest.mark.parametrize(("squeezed", "told"), [(0.53, True), (0.55, False)])
+def test_a_surface_that_creases_is_told(squeezed: float, told: bool) -> None:
+    """A block squeezed along x: its two ends keep their shape, all other faces are squeezed."""
+    _, report = check_points(X, X * [squeezed, 1.3, 1], clamp=())
+    assert ("creased-surface" in codes(report)) == told
+    if told:
+        size = np.ptp(X, axis=0)
+        ends = size[1] * size[2]
+        share = 1 - ends / (ends + size[0] * size[1] + size[0] * size[2])
+        message = codes(report)["creased-surface"]["message"]
+        assert f"{share:.1%} of the surface" in message
+        assert "down to 0.53" in message
+
+
+def test_a_few_squeezed_faces_are_not_worth_telling(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fab4d.stages.check.CREASED_SHARE", 0.99)
+    _, report = check_points(X, X * [0.5, 1.3, 1], clamp=())
+    assert "creased-surface" not in codes(report)
+
+
 def test_a_doubtful_material_is_told() -> None:
     _, report = check_points(X, Y, material="paper-printed")
     assert "Poisson ratio of glassy is -0.03" in codes(report)["material"]["message"]
