@@ -88,15 +88,16 @@ def judged(
 def _rounded_in(carried: Search, linear_rms: float, settings: ReducedSettings, trace: Trace) -> Search | None:
     """A near 0/1 design in the elements that a relaxed one was carried over to, or found there where these lose it.
 
-    linear_rms : RMS error, L0, of the relaxed design in linear elements        None where no equilibria lead to one
+    linear_rms : RMS error, L0, of the relaxed design in linear elements
+    None where no equilibria lead to one, or what is lost misses the tolerance by far.
     """
     tolerance = settings.weights.error_scale
     further = relaxed_from(carried, settings, trace.add, OTHER_ELEMENTS.relax_iterations)
     lost = further.at.relaxed_rms > max(LOST * linear_rms, LOST_SHARE * tolerance)
     rounded = None if lost else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     if rounded is None and carried.rms > tolerance:
-        rounded = _found_in(carried.equilibria.problem, settings, trace)
-    if rounded is None and lost:
+        rounded = _found_in(carried.equilibria.problem, replace(settings, patch_radii=(carried.patch_radius,)), trace)
+    if rounded is None and lost and not far_off(further.at, settings):
         rounded = rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     return rounded
 

@@ -209,11 +209,12 @@ def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_
 
 
 @pytest.mark.parametrize(
-    ("lost", "found_there", "steps"),
+    ("lost", "found_there", "far", "steps"),
     [
-        (0.99, True, ["relaxed", "rounded"]),
-        (1.01, True, ["relaxed", "searched"]),
-        (1.01, False, ["relaxed", "searched", "rounded"]),
+        (0.99, True, False, ["relaxed", "rounded"]),
+        (1.01, True, False, ["relaxed", "searched"]),
+        (1.01, False, False, ["relaxed", "searched", "rounded"]),
+        (1.01, False, True, ["relaxed", "searched"]),
     ],
 )
 def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_no_other(
@@ -221,9 +222,12 @@ def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_
     monkeypatch: pytest.MonkeyPatch,
     lost: float,
     found_there: bool,
+    far: bool,
     steps: list[str],
 ) -> None:
-    """lost : error of the design relaxed in quadratic elements, in the largest that is no loss"""
+    """lost : error of the design relaxed in quadratic elements, in the largest that is no loss
+    far : whether it misses the tolerance by far there
+    """
     bar, found, settings = relaxed_bar
     settings = replace(settings, weights=settings.weights.replace(error_scale=0.5 * found.relaxed_rms))
     done = list[str]()
@@ -236,18 +240,19 @@ def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_
         done.append("rounded")
         return relaxed.at
 
-    def searching(*_: Any) -> Search | None:
+    def searching(_: Problem, settings: ReducedSettings, __: Trace) -> Search | None:
         done.append("searched")
+        assert settings.patch_radii == (found.patch_radius,)
         return found if found_there else None
 
     for name, value in (("relaxed_from", relaxing), ("rounded_on", rounding), ("_found_in", searching)):
         monkeypatch.setattr(_finish, name, value)
-    monkeypatch.setattr(_finish, "far_off", lambda *_: False)
+    monkeypatch.setattr(_finish, "far_off", lambda at, _: far and at.equilibria.problem.body.order == 2)
     monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
     finish = _finish.finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
-    assert finish.found is not None
-    assert (finish.found is found) == (done[-1] == "searched")
+    assert (finish.found is None) == far
+    assert (finish.found is found) == (done[-1] == "searched" and not far)
     assert done == steps
 
 
