@@ -40,8 +40,9 @@ MOST_FITS = 3
 # that design comes within the same multiple of it.
 ALLOWED_LOSS = 1.15
 # A round of flips takes minutes on more than MANY_TETS: there held positions are first fitted to where loading ends,
-# and flips end at this share of the tolerance, or after a few. So they do where the relaxed design is out of reach of
-# the tolerance, and in quadratic elements that are too many to round in: there the first is the tolerance itself.
+# clear of unstable states unless they miss the tolerance there, and flips end at this share of the tolerance, or after
+# a few. So they do where the relaxed design is out of reach of the tolerance, and in quadratic elements that are too
+# many to round in: there the first is the tolerance itself.
 GOOD_ENOUGH, FEW_ROUNDS = 0.5, 5
 # At this share of the tolerance flips end with the first round that gains little; with more than MANY_DOFS unknowns,
 # where each round takes about a minute, at the tolerance.
@@ -78,7 +79,7 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
     tau_s = tau_seconds(problem)
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
-    weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
+    free = weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
     flips_last = rounding.n_tets > MANY_TETS
     if flips_last:
         weights = kept_clear(weights)
@@ -95,8 +96,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
             polish = _polish(weights, replace(settings, target_rms=weights.error_scale, rounds=FEW_ROUNDS), trace)
             equilibria, design = carried.equilibria, polish(carried.equilibria, carried.design)
         fit = _reachable_fit(equilibria, design, weights, radius, polish, trace)
+        if flips_last and _rms(fit.equilibria, fit.design) > weights.error_scale:
+            weights = free
+            fit = _other_fit(fit, weights, radius, _polish(weights, replace(settings, rounds=0), trace), trace)
         if flips_last and _rms(fit.equilibria, fit.design) > settings.target_rms:
-            fit = _flipped_fit(fit, weights, radius, _polish(weights, settings, trace), trace)
+            fit = _other_fit(fit, weights, radius, _polish(weights, settings, trace), trace)
     equilibria, smp = fit.equilibria, fit.design.rho > 0.5
     design = polished(equilibria, fit.design)
     trace.add("refit", Search(equilibria, design))
@@ -319,12 +323,12 @@ def _reachable_fit(
     return replace(nearest, fits=fits, missed=missed)
 
 
-def _flipped_fit(fit: _Fit, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace) -> _Fit:
-    """A fit of labels with flips, or the one before where loading ends no nearer to the temporary shape."""
-    flipped = polish(fit.equilibria, fit.design)
-    if flipped is fit.design:
+def _other_fit(fit: _Fit, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace) -> _Fit:
+    """A fit by other weights or with flips, or the one before where loading ends no nearer to the temporary shape."""
+    design = polish(fit.equilibria, fit.design)
+    if design is fit.design:
         return fit
-    after = _reachable_fit(fit.equilibria, flipped, weights, radius, polish, trace)
+    after = _reachable_fit(fit.equilibria, design, weights, radius, polish, trace)
     best = min(after, fit, key=lambda each: (each.loading is None, _rms(each.equilibria, each.design)))
     return replace(best, fits=fit.fits + after.fits, missed=min(fit.missed, after.missed))
 
