@@ -13,6 +13,8 @@ HARDLY_STABLE = (
 DO_NOT_HANG_WEIGHTS = (
     "HOLD POSITIONS, DO NOT HANG WEIGHTS: under forces that do not change as the part moves, this shape is unstable."
 )
+# Where less of its stiffness is left, what a printer and a rig do a little otherwise than planned may be enough.
+NEARLY_BUCKLED = 0.1
 PHASES = {"tpe": "TPE", "rubbery": "hot SMP", "glassy": "cold SMP"}
 
 
@@ -78,7 +80,21 @@ def warnings(sensitivity: Mapping[str, Any] | None) -> list[str]:
         return ["UNSTABLE: the part would not stay in this shape, or not in the one that it springs back to."]
     moved = [sensitivity["hold"]["random_rms_mm"], *point_errors(sensitivity)]
     hardly = [HARDLY_STABLE] if None in moved else []
-    return hardly + ([DO_NOT_HANG_WEIGHTS] if sensitivity["instability"]["dead_loads"] else [])
+    return (
+        hardly
+        + _nearly_buckled(sensitivity["softest"])
+        + ([DO_NOT_HANG_WEIGHTS] if sensitivity["instability"]["dead_loads"] else [])
+    )
+
+
+def _nearly_buckled(softest: Mapping[str, Any] | None) -> list[str]:
+    if softest is None or softest["stiffness_left"] >= NEARLY_BUCKLED:
+        return []
+    place = ", ".join(number(v, 0) for v in softest["at_mm"])
+    return [
+        f"NEARLY BUCKLED: held hot, the part keeps {100 * softest['stiffness_left']:.1f} % of its stiffness at rest "
+        f"near ({place}) mm of the printed part. Printed or pulled a little otherwise, it may snap to another shape."
+    ]
 
 
 def _force_deviations(force: Mapping[str, Any]) -> list[Deviation]:

@@ -13,6 +13,7 @@ from PIL import Image
 from fab4d.errors import ArtifactError
 from fab4d.io.csvtable import TRACE_COLUMNS, csv_bytes, read_csv
 from fab4d.io.scene import Goal
+from fab4d.report.careful import warnings
 from fab4d.report.page import _careful
 from fab4d.runner.summary import report_lines
 from fab4d.stages.monitor import SilentMonitor
@@ -112,6 +113,15 @@ def test_how_near_the_part_is_to_buckling_is_told_where_it_is_known(result, sens
     page = result["report_html"].decode()
     assert "near (12, 3, 0) mm of the printed part: of its stiffness at rest 22 % is left there" in page
     assert _careful(sensitivity | {"softest": None}).count("<p>") == _careful(sensitivity).count("<p>") - 1
+
+
+@pytest.mark.parametrize(("left", "told"), [(0.054, True), (0.1, False)])
+def test_a_part_that_has_nearly_buckled_is_warned_of(sensitivity, left, told):
+    said = [
+        words for words in warnings(sensitivity | {"softest": {"stiffness_left": left, "at_mm": [12.0, 3.0, -0.2]}})
+    ]
+    assert any("keeps 5.4 % of its stiffness at rest near (12, 3, 0) mm" in words for words in said) == told
+    assert len(said) == len(warnings(sensitivity | {"softest": None})) + told
 
 
 def test_sensitivity_is_told_on_the_page(result, sensitivity):
