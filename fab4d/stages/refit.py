@@ -300,8 +300,9 @@ def _reachable_fit(
 
     radius : of a patch, L0
     Where it is another equilibrium than the fit's, and misses the tolerance, a point moves to where the two differ
-    most, or else positions and labels are fitted again from where loading ended. The state nearest to the temporary
-    shape among those that loading ended in; the last fit where no loading went all the way.
+    most, or else positions and labels are fitted again from where loading ended, unless the fit misses the tolerance by
+    far. The state nearest to the temporary shape among those that loading ended in; the last fit where no loading went
+    all the way.
     """
     ends, missed = list[tuple[float, _Fit]](), np.inf
     for fits in range(1, MOST_FITS + 1):
@@ -314,7 +315,8 @@ def _reachable_fit(
         if not there:
             missed = min(missed, _rms(equilibria, design))
             trace.add("reached", Search(equilibria, end))
-        if there or (whole and rms <= weights.error_scale):
+        hopeless = _rms(equilibria, design) > OUT_OF_REACH * weights.error_scale
+        if there or (whole and (hopeless or rms <= weights.error_scale)):
             break
         if fits < MOST_FITS:
             equilibria, design = _begun_again(equilibria, design, end, whole, weights, radius)

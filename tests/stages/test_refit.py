@@ -456,11 +456,15 @@ def test_no_loading_is_handed_on_that_does_not_go_all_the_way(
     assert found["refit_report"]["fits"] == refit.MOST_FITS
 
 
-@pytest.mark.parametrize("tolerance", [1e9, 1e-9])
+@pytest.mark.parametrize(("tolerance", "far", "fits"), [(1e9, np.inf, 1), (1e-9, np.inf, 3), (1e-9, 1.25, 1)])
 def test_the_best_state_that_loading_ends_in_is_delivered(
-    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, tolerance: float
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, tolerance: float, far: float, fits: int
 ) -> None:
-    """Loading that ends in other equilibria than the fits': the first within the tolerance, or else the nearest one."""
+    """Loading that ends in other equilibria than the fits': the first within the tolerance, or else the nearest one.
+
+    far : beyond this multiple of the tolerance fits are not made again
+    """
+    monkeypatch.setattr(refit, "OUT_OF_REACH", far)
     ends = list[Programming]()
 
     def elsewhere(equilibria: Equilibria, rho: np.ndarray, x: np.ndarray, forces: np.ndarray) -> Programming:
@@ -473,7 +477,7 @@ def test_the_best_state_that_loading_ends_in_is_delivered(
     monkeypatch.setattr(refit, "same_shape", lambda done, x: False)  # noqa: ARG005
     monkeypatch.setattr(refit, "polished", lambda equilibria, design: design)  # noqa: ARG005
     found = refit.run(inputs, PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=4)}, SilentMonitor())
-    assert found["refit_report"]["fits"] == len(ends) == (1 if tolerance > 1 else refit.MOST_FITS)
+    assert found["refit_report"]["fits"] == len(ends) == fits
     problem = equilibria_of(inputs, found).problem
     L0, reached = problem.length, [shape_error(problem, end.final.y).rms for end in ends]
     wanted = ends[int(np.argmin(reached))]
