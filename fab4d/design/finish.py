@@ -33,6 +33,9 @@ MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # the last is 0 or 1, and leaves a smaller error. So they are at once where the median shape is kept clear of unstable
 # states.
 HARD_STEPS, LAST_SHARE = 2, 0.7
+# Whatever its share, what is undecided is so where a design came near unstable states, or where other elements have
+# been searched themselves: steps are hard because of that.
+ANY_SHARE = 1.0
 # It is rounded in half the steps of a search from the start.
 ROUND_GROWTH = 2.5
 
@@ -51,8 +54,6 @@ class Rounding:
 
 # The design is near already.
 OTHER_ELEMENTS = Rounding(relax_iterations=3, most_left=LAST_SHARE)
-# Where other elements have been searched themselves, steps are hard because of them.
-SEARCHED_LEFT = 1.0
 # The design is farther from its best on a finer mesh than in other elements of the same one.
 FINER_MESH = Rounding(relax_iterations=8, most_left=LAST_SHARE)
 # A median shape is clear of unstable states where each mode keeps this share of its stiffness. One that has lost it
@@ -121,13 +122,18 @@ def relaxed_from(carried: Search, settings: ReducedSettings, watch: Watch, itera
     """A design that was carried over, relaxed further.
 
     iterations : of relaxing at most
-    Where that comes near unstable states, it goes on clear of them. Where it ends not far from there, rounding keeps
-    clear of them.
     """
     settings = replace(settings, relax_iterations=iterations, nearly=1.0)
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    at = _relaxed_further(at, settings, watch)
+    return relaxed_clear(_relaxed_further(at, settings, watch), settings, watch)
+
+
+def relaxed_clear(at: Search, settings: ReducedSettings, watch: Watch) -> Relaxed:
+    """A relaxed design, relaxed further clear of unstable states if it is near them.
+
+    Where it is not far from them, rounding keeps clear of them.
+    """
     ratio = _least_ratio(at)
     if ratio < SOFT:
         settings = replace(settings, weights=kept_clear(settings.weights))
@@ -148,9 +154,10 @@ def _relaxed_further(at: Search, settings: ReducedSettings, watch: Watch) -> Sea
 def rounded_on(relaxed: Relaxed, watch: Watch, most_left: float) -> Search | None:
     """A near 0/1 design from a relaxed one in the same elements; None where no equilibria lead to 0 and 1.
 
-    most_left : share of all tets, at most, that is decided by and by: at once where it is clear of unstable states, or
-        else where steps are hard
+    most_left : share of all tets, at most, that is decided by and by where steps are hard; all are so at once where it
+        was relaxed clear of unstable states
     """
+    most_left = ANY_SHARE if relaxed.clear else most_left
     at, settings = relaxed.at, replace(relaxed.settings, round_growth=ROUND_GROWTH)
     L, hard, held_back, by_and_by, tried = smoothness_matrix(at.equilibria.problem), 0, 0, relaxed.clear, False
     while True:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fab4d.design.finish import OTHER_ELEMENTS, SEARCHED_LEFT, Relaxed, carried_in, relaxed_from, rounded_on
+from fab4d.design.finish import ANY_SHARE, OTHER_ELEMENTS, carried_in, relaxed_clear, relaxed_from, rounded_on
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import Phase, ReducedSettings, Search, relaxed
 from fab4d.errors import EquilibriumError
@@ -89,15 +89,16 @@ def _rounded_in(carried: Search, linear_rms: float, settings: ReducedSettings, t
     """A near 0/1 design in the elements that a relaxed one was carried over to, or found there where these lose it.
 
     linear_rms : RMS error, L0, of the relaxed design in linear elements
-    None where no equilibria lead to one, or what is lost misses the tolerance by far.
+    None where no equilibria lead to one, or it misses the tolerance by far when relaxed and no other is found.
     """
     tolerance = settings.weights.error_scale
     further = relaxed_from(carried, settings, trace.add, OTHER_ELEMENTS.relax_iterations)
     lost = further.at.relaxed_rms > max(LOST * linear_rms, LOST_SHARE * tolerance)
-    rounded = None if lost else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
+    hopeless = far_off(further.at, settings)
+    rounded = None if lost or hopeless else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     if rounded is None and carried.rms > tolerance:
         rounded = _found_in(carried.equilibria.problem, replace(settings, patch_radii=(carried.patch_radius,)), trace)
-    if rounded is None and lost and not far_off(further.at, settings):
+    if rounded is None and lost and not hopeless:
         rounded = rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     return rounded
 
@@ -121,4 +122,5 @@ def _found_in(problem: Problem, settings: ReducedSettings, trace: Trace) -> Sear
         return None
     if at.relaxed_rms > settings.weights.error_scale:
         return None
-    return rounded_on(Relaxed(at, settings), trace.add, SEARCHED_LEFT)
+    settings = replace(settings, relax_iterations=OTHER_ELEMENTS.relax_iterations, nearly=1.0)
+    return rounded_on(relaxed_clear(at, settings, trace.add), trace.add, ANY_SHARE)

@@ -215,6 +215,7 @@ def test_quadratic_elements_that_lose_a_design_are_searched_themselves_where_it_
         (1.01, True, False, ["relaxed", "searched"]),
         (1.01, False, False, ["relaxed", "searched", "rounded"]),
         (1.01, False, True, ["relaxed", "searched"]),
+        (0.99, True, True, ["relaxed", "searched"]),
     ],
 )
 def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_no_other(
@@ -251,20 +252,31 @@ def test_a_design_that_quadratic_elements_lose_is_rounded_only_where_these_find_
     monkeypatch.setattr(_finish, "LINEAR_HOLDS", 0.0)
     profile = PROFILE | {"goal": Goal(tolerance=1.0, max_forces=3)}
     finish = _finish.finished(bar, profile, "quadratic", found, settings, trace_of(found.equilibria.problem, bar))
-    assert (finish.found is None) == far
-    assert (finish.found is found) == (done[-1] == "searched" and not far)
+    assert (finish.found is None) == (far and not found_there)
+    assert (finish.found is found) == (done[-1] == "searched" and found_there)
     assert done == steps
 
 
 @pytest.mark.parametrize(("tolerance", "reached"), [(1.0, True), (1e-6, False)])
 def test_a_search_in_quadratic_elements_ends_in_labels_or_where_the_relaxed_design_misses_the_tolerance(
-    relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings], tolerance: float, reached: bool
+    relaxed_bar: tuple[dict[str, np.ndarray], Search, ReducedSettings],
+    monkeypatch: pytest.MonkeyPatch,
+    tolerance: float,
+    reached: bool,
 ) -> None:
+    """Labels come from a design that keeps clear of unstable states."""
     bar, profile = relaxed_bar[0], PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=3)}
     problem = problem_of(bar, PROFILE["materials"], "quadratic")
+    cleared, relaxed_clear = list[Search](), _finish.relaxed_clear
+
+    def watched(at: Search, *rest: Any) -> Relaxed:
+        cleared.append(at)
+        return relaxed_clear(at, *rest)
+
+    monkeypatch.setattr(_finish, "relaxed_clear", watched)
     settings, trace = search_settings(problem, profile), trace_of(problem, bar)
     found = _finish._found_in(problem, settings, trace)
-    assert (found is not None) == reached
+    assert (found is not None) == bool(cleared) == reached
     shown = [row["phase"] for row in trace.rows]
     assert shown[:2] == ["start", "relax"]
     assert ("round" in shown) == reached
