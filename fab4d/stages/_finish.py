@@ -94,11 +94,12 @@ def _rounded_in(carried: Search, linear_rms: float, settings: ReducedSettings, t
     tolerance = settings.weights.error_scale
     further = relaxed_from(carried, settings, trace.add, OTHER_ELEMENTS.relax_iterations)
     lost = further.at.relaxed_rms > max(LOST * linear_rms, LOST_SHARE * tolerance)
-    hopeless = far_off(further.at, settings)
-    rounded = None if lost or hopeless else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
+    far = far_off(further.at, settings)
+    # What keeping clear of unstable states costs, rounding may win back.
+    rounded = None if lost or (far and not further.clear) else rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     if rounded is None and carried.rms > tolerance:
         rounded = _found_in(carried.equilibria.problem, replace(settings, patch_radii=(carried.patch_radius,)), trace)
-    if rounded is None and lost and not hopeless:
+    if rounded is None and lost and not far:
         rounded = rounded_on(further, trace.add, OTHER_ELEMENTS.most_left)
     return rounded
 
