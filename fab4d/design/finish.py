@@ -106,7 +106,7 @@ class Relaxed:
 
     at: Search
     settings: ReducedSettings
-    clear: bool = False
+    clear: bool
 
 
 def rounded_from(carried: Search, settings: ReducedSettings, watch: Watch, how: Rounding) -> Search | None:

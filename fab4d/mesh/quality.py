@@ -92,12 +92,6 @@ def largest_stretches(F: FloatArray) -> FloatArray:
 
 def smallest_surface_stretches(X: FloatArray, x: FloatArray, faces: IntArray) -> FloatArray:
     """Smaller principal stretch (b,) of triangles (b, 3) in their plane, from vertices X to x (n, 3)."""
-    metrics = []
-    for vertices in (X, x):
-        sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-        metrics.append(sides @ np.swapaxes(sides, 1, 2))
-    C = np.linalg.solve(*metrics)
-    half, det = 0.5 * np.trace(C, axis1=1, axis2=2), np.linalg.det(C)
-    # The smaller root of l^2 - 2 half l + det, without cancellation.
-    larger = half + np.sqrt(np.maximum(half**2 - det, 0.0))
-    return np.sqrt(np.maximum(det, 0.0) / larger)
+    before, after = (np.swapaxes(v[faces[:, 1:]] - v[faces[:, :1]], 1, 2) for v in (X, x))
+    in_plane = after @ np.linalg.inv(np.linalg.qr(before, mode="r"))
+    return np.linalg.svd(in_plane, compute_uv=False)[:, -1].astype(np.float64)

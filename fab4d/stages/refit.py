@@ -308,14 +308,14 @@ def _reachable_fit(
     for fits in range(1, MOST_FITS + 1):
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         end = _programmed(done, design.rho)
-        rms = _rms(equilibria, end)
+        fitted_rms, rms = _rms(equilibria, design), _rms(equilibria, end)
         there, whole = same_shape(done, design.median.x), done.loaded == done.unloaded == 1.0
         if whole:
             ends.append((rms, _Fit(equilibria, end, loading=done)))
         if not there:
-            missed = min(missed, _rms(equilibria, design))
+            missed = min(missed, fitted_rms)
             trace.add("reached", Search(equilibria, end))
-        hopeless = _rms(equilibria, design) > OUT_OF_REACH * weights.error_scale
+        hopeless = fitted_rms > OUT_OF_REACH * weights.error_scale
         if there or (whole and (hopeless or rms <= weights.error_scale)):
             break
         if fits < MOST_FITS:
