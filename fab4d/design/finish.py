@@ -154,8 +154,8 @@ def _relaxed_further(at: Search, settings: ReducedSettings, watch: Watch) -> Sea
 def rounded_on(relaxed: Relaxed, watch: Watch, most_left: float) -> Search | None:
     """A near 0/1 design from a relaxed one in the same elements; None where no equilibria lead to 0 and 1.
 
-    most_left : share of all tets, at most, that is decided by and by where steps are hard; all are so at once where it
-        was relaxed clear of unstable states
+    most_left : share of all tets, at most, that is decided by and by where steps are hard, and all where they come to
+        nothing; all are so at once where it was relaxed clear of unstable states
     """
     most_left = ANY_SHARE if relaxed.clear else most_left
     at, settings = relaxed.at, replace(relaxed.settings, round_growth=ROUND_GROWTH)
@@ -174,7 +174,7 @@ def rounded_on(relaxed: Relaxed, watch: Watch, most_left: float) -> Search | Non
         hard = hard + 1 if _is_hard(at) else 0
         held_back = held_back + 1 if hard and not decided_much else 0
         by_and_by = hard >= HARD_STEPS
-    return decided(at, settings, most_left)
+    return decided(at, settings)
 
 
 def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:

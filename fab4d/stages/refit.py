@@ -56,6 +56,9 @@ FEW_STEPS = 3
 CLEARLY_WORSE = 1.1
 # What is predicted beyond this multiple of the error before is as likely a failure of the prediction.
 NOT_TRUE = 3.0
+# Labels that err by more than this multiple of what was predicted of them, fitted, tell that others may be better than
+# predicted ones: of a thin limb, flips that each do little together take what holds it.
+FAR_FROM_TRUE = 2.0
 # Squeezed surfaces count for less than in the search: what that kept from the limit of their stability, labels that are
 # 0 or 1 take up, and positions that made up for it would miss the temporary shape by more.
 LEAST_STRETCH, LAM_SQUEEZE = 0.5, 1000.0
@@ -202,23 +205,24 @@ def _ways(
 
     smp : (m,) its repair. Others make up for what it costs, or mend the labels for little error rather than by few
     changes. Of more than FEW_TETS, what is predicted to be no better than what was found, or clearly worse than what
-    was predicted of another that was followed, is left out if that can be true.
+    was predicted of another that was followed and came true, is left out if that can be true.
     """
     problem, few = equilibria.problem, equilibria.problem.n_tets <= FEW_TETS
     most = NOT_TRUE * _rms(equilibria, before)
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
-    best = promised = np.inf
+    best, promised, came_true = np.inf, np.inf, True
     for labels in _repairs(problem, flips, rounded, smp, settings):
         left = 0.0 if flips is None else error_left(flips, rounded, labels)
-        worse = left <= most and (left >= best or left > CLEARLY_WORSE * promised)
+        worse = left <= most and (left >= best or (came_true and left > CLEARLY_WORSE * promised))
         if (worse and not few) or any((labels == other).all() for other in tried):
             continue
         tried.append(labels)
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
         if followed is not None:
-            best = min(best, _rms(equilibria, followed.fitted))
-            promised = min(promised, left)
+            rms = _rms(equilibria, followed.fitted)
+            came_true = came_true and rms <= FAR_FROM_TRUE * left
+            best, promised = min(best, rms), min(promised, left)
         yield followed
 
 

@@ -159,19 +159,17 @@ def test_tets_are_not_decided_by_and_by_where_steps_lead_on(
     assert rounded_from(carried, settings_for(quadratic), lambda *_: None, OTHER_ELEMENTS) is not None
 
 
-def test_what_steps_leave_undecided_is_rounded_up_to_a_share(
+def test_what_hard_steps_leave_undecided_is_decided_by_and_by_whatever_its_share(
     found: Search, quadratic: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the first step of the rounding, which leaves more than the share that may be."""
+    """After the first step of the rounding, which leaves more than what may be decided so while steps lead on."""
     for name, value in (("_is_hard", lambda _: True), ("MOST_HELD_BACK", 1), ("LITTLE_DECIDED", 0.0)):
         monkeypatch.setattr(finish, name, value)
     carried, settings = carried_in(quadratic, found), settings_for(quadratic)
     assert carried is not None
     shown: list[Search] = []
-    few, all_of_them = (replace(OTHER_ELEMENTS, most_left=share) for share in (0.05, 1.0))
-    assert rounded_from(carried, settings, lambda _, at: shown.append(at), few) is None
+    at = rounded_from(carried, settings, lambda _, at: shown.append(at), replace(OTHER_ELEMENTS, most_left=0.05))
     assert undecided_fraction(shown[-1].design.rho) > 0.05
-    at = rounded_from(carried, settings, lambda *_: None, all_of_them)
     assert at is not None
     assert undecided_fraction(at.design.rho) <= settings.undecided_fraction
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
