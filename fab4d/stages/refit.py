@@ -15,10 +15,10 @@ from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Ahead, Design, build_model
 from fab4d.design.influence import Influence
 from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
-from fab4d.design.patches import Patches, outward_normals
+from fab4d.design.patches import Patches, outward_normals, patches_from_faces
 from fab4d.design.paths import SMALLEST_STEP, change_density, follow_density
 from fab4d.design.polish import polish_labels
-from fab4d.design.problem import Problem
+from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import Search, polished, refit
 from fab4d.errors import EquilibriumError
 from fab4d.fabrication.annealing import annealer
@@ -67,7 +67,6 @@ PATIENT_STEP = 1e-3
 # Of up to so many tets each counts, and where flips end is chance: they begin again from other labels there, as long
 # as they do not reach the goal, for that takes seconds.
 FEW_TETS = 1_000
-NOT_HELD = "the design has no equilibrium in quadratic elements: use linear ones ([solver] element)"
 Polish = Callable[[Equilibria, Design], Design]
 
 
@@ -168,32 +167,40 @@ def _printed_designs(
     On more than MANY_TETS smp itself is solved for at once: on the path of equilibria from the relaxed design to it,
     short waves on squeezed surfaces turn unstable at every small step. On fewer, other flips make up for the repair; as
     long as the design is beyond the reach of some rounds of flips, the repair alone is tried, and another way to mend
-    the labels.
+    the labels. Of a design that is out of reach of the tolerance one way is tried, and no small steps.
     """
     problem, rho = equilibria.problem, smp.astype(np.float64)
     design = _carried(equilibria, relaxed, rho) if problem.n_tets > MANY_TETS else None
     if design is not None:
         yield _Printed(design, design)
         return
-    before, found = _relaxed_design(equilibria, relaxed), list[_Printed]()
+    before, found = _carried(equilibria, relaxed, relaxed["rho"]), list[_Printed]()
+    if before is None:
+        x, forces = relaxed["x"] / problem.length, relaxed["patch_force"] / problem.force
+        x = x if len(x) == problem.n_nodes else at_nodes(problem, x)
+        design = _loaded_from_rest(equilibria, rho, x, forces)
+        yield _Printed(design, design)
+        return
 
     def rms_of(printed: _Printed) -> float:
         return _rms(equilibria, printed.fitted)
 
+    relaxed_rms = float(relaxed["relaxed_rms"]) / problem.length
+    hopeless = min(relaxed_rms, _rms(equilibria, before)) > OUT_OF_REACH * settings.tolerance
     ways = _ways(equilibria, before, smp, weights, settings)
     for followed in ways:
         found += [] if followed is None else [followed]
-        if min(map(rms_of, found), default=np.inf) <= WITHIN_REACH * settings.target_rms:
+        if hopeless or min(map(rms_of, found), default=np.inf) <= WITHIN_REACH * settings.target_rms:
             break
-    if not found:
+    if not found and not hopeless:
         followed = _followed(equilibria, before, smp, weights, patient=True)
         found = [] if followed is None else [followed]
     if not found:
-        design = _programmed(program(equilibria, rho, before.median.x, before.median.forces), rho)
+        design = _loaded_from_rest(equilibria, rho, before.median.x, before.median.forces)
         found = [_Printed(design, design)]
     first = min(found, key=rms_of)
     yield first
-    if problem.n_tets <= FEW_TETS:
+    if problem.n_tets <= FEW_TETS and not hopeless:
         yield from (each for each in found if each is not first)
         yield from (each for each in ways if each is not None)
 
@@ -404,26 +411,20 @@ def flip_settings(mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Go
     )
 
 
-def _relaxed_design(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray]) -> Design:
-    """The relaxed design in equilibrium for the elements of the rounding.
-
-    Raises EquilibriumError where these find no equilibrium near it.
-    """
-    design = _carried(equilibria, relaxed, relaxed["rho"])
-    if design is None:
-        raise EquilibriumError(NOT_HELD)
-    return design
-
-
 def _in_elements_of(problem: Problem, at: Search) -> Search:
-    """A design in other elements of the same mesh.
-
-    Raises EquilibriumError where these find no equilibrium near it.
-    """
+    """A design in other elements of the same mesh: near it, or where loading from rest ends."""
     carried = carried_in(problem, at)
-    if carried is None:
-        raise EquilibriumError(NOT_HELD)
-    return carried
+    if carried is not None:
+        return carried
+    patches, median = at.equilibria.patches, at.design.median
+    equilibria = Equilibria(problem, patches_from_faces(problem, patches.centers, patches.faces, patches.offsets))
+    design = _loaded_from_rest(equilibria, at.design.rho, at_nodes(problem, median.x), median.forces)
+    return replace(at, equilibria=equilibria, design=design)
+
+
+def _loaded_from_rest(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray) -> Design:
+    """The labels rho (m,) where loading to the median shape x (N, 3) ends, or as far as that comes."""
+    return _programmed(program(equilibria, rho, x, forces), rho)
 
 
 def _carried(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], rho: FloatArray) -> Design | None:

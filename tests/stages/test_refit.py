@@ -14,18 +14,20 @@ from bent_bar import PROFILE as BENT_BAR
 from bent_bar import bent_bar
 
 from fab4d.design import finish, reduced
-from fab4d.design.equilibria import Equilibria
+from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria
 from fab4d.design.flips import FlipSettings, at_interface
 from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.paths import change_density, follow_density
 from fab4d.design.problem import Problem
+from fab4d.design.reduced import Search
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages import _design, _element, refit, solve, threshold
+from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._design import Trace, objective_weights, patches_of, problem_of
 from fab4d.stages._element import problem_like
 from fab4d.stages.monitor import SilentMonitor
@@ -101,13 +103,22 @@ def test_what_is_too_large_to_round_in_quadratic_elements_is_fitted_in_them(
     assert float(rows[-1]["rms_mm"]) < 0.9 * float(rows[carried]["rms_mm"])
 
 
-def test_a_design_that_quadratic_elements_do_not_hold_is_told(
+def test_a_design_that_quadratic_elements_do_not_hold_is_loaded_in_them(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """From rest: a bar comes so to where it would have been carried over to, and the fit goes on from there."""
+    equilibria, _, _ = fit_of(inputs)
+    quadratic = problem_of(inputs["mesh"], PROFILE["materials"], "quadratic")
+    design = change_density(equilibria, relaxed_design(equilibria, inputs), inputs["rounded"]["smp"].astype(np.float64))
+    carried = refit._in_elements_of(quadratic, Search(equilibria, design))
     monkeypatch.setattr(refit, "carried_in", lambda *_: None)
+    loaded = refit._in_elements_of(quadratic, Search(equilibria, design))
+    np.testing.assert_allclose(loaded.design.median.x, carried.design.median.x, atol=1e-6)
+    assert loaded.rms == pytest.approx(carried.rms, rel=1e-6)
     monkeypatch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
-    with pytest.raises(EquilibriumError, match=r"no equilibrium in quadratic elements: use linear ones"):
-        refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
+    found = refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
+    assert equilibria_of(inputs, found).problem.body.order == 2
+    assert errors(found)[-1] < 0.8
 
 
 def test_the_fit_comes_nearer_than_the_relaxed_positions(fitted: tuple[str, Artifacts]) -> None:
@@ -156,9 +167,59 @@ def test_labels_of_many_tets_are_solved_for_at_once(inputs: Artifacts, monkeypat
     np.testing.assert_allclose(at_once.median.x, by_path.median.x, atol=1e-5)
     R, t = best_rigid_motion(at_once.final.y, by_path.final.y)
     np.testing.assert_allclose(at_once.final.y @ R.T + t, by_path.final.y, atol=1e-5)
+
+
+def relaxed_design(equilibria: Equilibria, inputs: Artifacts) -> Design:
+    design = refit._carried(equilibria, inputs["relaxed"], inputs["relaxed"]["rho"])
+    assert design is not None
+    return design
+
+
+@pytest.mark.parametrize("element", ["linear", "quadratic"])
+@pytest.mark.parametrize("many", [1, 1_000_000])
+def test_a_design_without_an_equilibrium_is_loaded_from_rest(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, element: str, many: int
+) -> None:
+    """Also one of other elements than these."""
+    problem = problem_of(inputs["mesh"], PROFILE["materials"], element)
+    equilibria, smp = Equilibria(problem, patches_of(problem, inputs["relaxed"])), inputs["rounded"]["smp"]
+    _, weights, settings = fit_of(inputs)
     monkeypatch.setattr(refit, "carried_over", lambda *_: None)
-    with pytest.raises(EquilibriumError, match="no equilibrium"):
-        next(refit._printed_designs(*given))
+    monkeypatch.setattr(refit, "MANY_TETS", many)
+    (printed,) = refit._printed_designs(equilibria, inputs["relaxed"], smp, weights, settings)
+    np.testing.assert_array_equal(printed.design.rho, smp)
+    median = printed.design.median
+    held = equilibria.patches.mean(median.x) + RIG_COMPLIANCE * median.forces
+    linear, _, _ = fit_of(inputs)
+    x, forces = inputs["relaxed"]["x"] / problem.length, inputs["relaxed"]["patch_force"] / problem.force
+    x = x if len(x) == linear.problem.n_nodes else x[: linear.problem.n_nodes]
+    aim = linear.patches.mean(x) + RIG_COMPLIANCE * forces
+    np.testing.assert_allclose(held, aim, atol=2e-3)
+
+
+@pytest.mark.parametrize(("beyond", "ways"), [(0.99, [False, False, False, True]), (1.01, [False])])
+def test_of_a_design_that_is_out_of_reach_one_way_to_printable_labels_is_tried(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, beyond: float, ways: list[bool]
+) -> None:
+    """Without small steps, which take minutes; loading from rest ends with labels too."""
+    equilibria, weights, settings = fit_of(inputs)
+    rounded, smp = rms(equilibria.problem, relaxed_design(equilibria, inputs)), inputs["rounded"]["smp"]
+    relaxed_rms = np.array(2 * rounded * equilibria.problem.length)
+    settings = replace(settings, tolerance=rounded / (beyond * OUT_OF_REACH))
+    asked = list[bool]()
+
+    def followed(*_: Any, patient: bool = False) -> None:
+        asked.append(patient)
+
+    labels = [smp.copy(), smp.copy()]
+    for k, each in enumerate(labels):
+        each[np.flatnonzero(at_interface(equilibria.problem, smp))[k]] ^= True
+    monkeypatch.setattr(refit, "_followed", followed)
+    monkeypatch.setattr(refit, "_repairs", lambda *_: [*labels, smp])
+    given = inputs["relaxed"] | {"relaxed_rms": relaxed_rms}
+    (printed,) = refit._printed_designs(equilibria, given, smp, weights, settings)
+    np.testing.assert_array_equal(printed.design.rho, smp)
+    assert asked == ways
 
 
 @pytest.mark.parametrize("most", [1, 1_000_000])
@@ -270,7 +331,7 @@ def test_other_flips_make_up_for_the_repair(inputs: Artifacts) -> None:
     problem, weights = equilibria.problem, weights.replace(lam_squeeze=0.0)
     spoilt = inputs["rounded"]["smp"].copy()
     spoilt[np.flatnonzero(at_interface(problem, spoilt))[::12]] ^= True
-    before = refit._relaxed_design(equilibria, inputs["relaxed"])
+    before = relaxed_design(equilibria, inputs)
     as_they_are = change_density(equilibria, before, spoilt.astype(np.float64))
     printed = next(refit._printed_designs(equilibria, inputs["relaxed"], spoilt, weights, settings)).design
     fits = [refit.refit(equilibria, each, weights, lambda at: None) for each in (as_they_are, printed)]  # noqa: ARG005
@@ -320,7 +381,7 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
     other[np.flatnonzero(at_interface(problem, smp))[0]] ^= True
     third = smp.copy()
     third[np.flatnonzero(at_interface(problem, smp))[1]] ^= True
-    before = refit._relaxed_design(equilibria, inputs["relaxed"])
+    before = relaxed_design(equilibria, inputs)
     design = change_density(equilibria, before, other.astype(np.float64))
     tried: list[BoolArray] = []
 
@@ -370,7 +431,7 @@ def test_labels_that_are_predicted_to_be_no_better_than_what_was_found_are_not_f
     labels = [smp.copy(), smp.copy(), smp]
     for k in (0, 1):
         labels[k][np.flatnonzero(at_interface(equilibria.problem, smp))[k]] ^= True
-    before = refit._relaxed_design(equilibria, inputs["relaxed"])
+    before = relaxed_design(equilibria, inputs)
     printed = refit._Printed(before, before)
     tried: list[int] = []
 
@@ -401,7 +462,7 @@ def test_flips_begin_again_until_they_come_to_the_goal(
 ) -> None:
     """goal : the error at which they end; they come to 2, 1 and 3, and the least is taken."""
     equilibria, _, settings = fit_of(inputs)
-    first = refit._relaxed_design(equilibria, inputs["relaxed"])
+    first = relaxed_design(equilibria, inputs)
     designs = [first, replace(first), replace(first)]
     errors = {id(design): error for design, error in zip(designs, (2.0, 1.0, 3.0), strict=True)}
     monkeypatch.setattr(refit, "shape_error", lambda _, y: SimpleNamespace(rms=errors[y]))
