@@ -327,7 +327,7 @@ def _reachable_fit(
             missed = min(missed, fitted_rms)
             trace.add("reached", Search(equilibria, end))
         hopeless = fitted_rms > OUT_OF_REACH * weights.error_scale
-        if there or (whole and (hopeless or rms <= weights.error_scale)):
+        if there or hopeless or (whole and rms <= weights.error_scale):
             break
         if fits < MOST_FITS:
             equilibria, design = _begun_again(equilibria, design, end, whole, weights, radius)

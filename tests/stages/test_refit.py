@@ -510,13 +510,16 @@ def test_the_end_of_the_loading_is_handed_on(inputs: Artifacts, fitted: tuple[st
     assert loaded["load_steps"] > 2
 
 
+@pytest.mark.parametrize("hopeless", [True, False])
 def test_no_loading_is_handed_on_that_does_not_go_all_the_way(
-    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, hopeless: bool
 ) -> None:
+    """Fits are made again, unless they miss the tolerance by far."""
+    monkeypatch.setattr(refit, "OUT_OF_REACH", 0.0 if hopeless else np.inf)
     monkeypatch.setattr(refit, "program", lambda *given: replace(program(*given), loaded=0.9))
     found = refit.run(inputs, PROFILE, SilentMonitor())
     assert found["loaded"] is None
-    assert found["refit_report"]["fits"] == refit.MOST_FITS
+    assert found["refit_report"]["fits"] == (1 if hopeless else refit.MOST_FITS)
 
 
 @pytest.mark.parametrize(("tolerance", "far", "fits"), [(1e9, np.inf, 1), (1e-9, np.inf, 3), (1e-9, 1.25, 1)])
