@@ -29,7 +29,7 @@ from fab4d.mesh.tetmesh import BoolArray, FloatArray
 from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._coarse import MANY_TETS
 from fab4d.stages._design import Trace, objective_weights, patch_arrays, patches_of, problem_of, tau_seconds
-from fab4d.stages._element import elements_for
+from fab4d.stages._element import Elements, element_of, elements_for
 from fab4d.stages._repair import influence_near
 from fab4d.stages.monitor import Monitor
 from fab4d.stages.threshold import labels_for
@@ -67,13 +67,38 @@ PATIENT_STEP = 1e-3
 # Of up to so many tets each counts, and where flips end is chance: they begin again from other labels there, as long
 # as they do not reach the goal, for that takes seconds.
 FEW_TETS = 1_000
+# A design that misses the tolerance by far is rejected whatever elements tell of it, and quadratic ones, where it is
+# hard to hold, take minutes for that.
+NOT_QUADRATIC = {"what": "quadratic elements", "why": "the design misses the tolerance by far in linear ones"}
 Polish = Callable[[Equilibria, Design], Design]
 
 
 def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor) -> dict[str, Any]:
     """Follow the relaxed design to the printed labels and fit the held positions, in a state that loading reaches."""
+    wanted = profile["solver"].element
+    elements = elements_for(inputs["mesh"], wanted)
+    if wanted == "auto" and elements.last_fit == "quadratic" and _missed_by_far(inputs, profile):
+        linear = Elements("linear", "linear", [NOT_QUADRATIC])
+        found, met = _fitted_in(linear, inputs, profile, monitor)
+        if not met:
+            return found
+    return _fitted_in(elements, inputs, profile, monitor)[0]
+
+
+def _missed_by_far(inputs: Mapping[str, Any], profile: Mapping[str, Any]) -> bool:
+    """Whether the design was found in linear elements, and misses the tolerance by far there."""
+    mesh, relaxed = inputs["mesh"], inputs["relaxed"]
+    problem = problem_of(mesh, profile["materials"], "linear")
+    weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
+    rms = float(relaxed["relaxed_rms"]) / problem.length
+    return element_of(mesh, relaxed["x"]) == "linear" and rms > OUT_OF_REACH * weights.error_scale
+
+
+def _fitted_in(
+    elements: Elements, inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor
+) -> tuple[dict[str, Any], bool]:
+    """What the stage writes, with the last fit in these elements, and whether that meets the tolerance."""
     mesh, relaxed, rounded = inputs["mesh"], inputs["relaxed"], inputs["rounded"]
-    elements = elements_for(mesh, profile["solver"].element)
     rounding = problem = problem_of(mesh, profile["materials"], elements.rounding)
     if elements.last_fit != elements.rounding:
         problem = problem_of(mesh, profile["materials"], elements.last_fit)
@@ -117,13 +142,14 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
         "reasons": reasons,
         "left_out": elements.left_out,
     }
-    return {
+    found = {
         "labels": {"smp": smp, "cluster": smp_clusters(mesh["tets"], volumes, smp)},
         "printed": printed,
         "loaded": None if fit.loading is None else _loaded_arrays(fit.loading, problem),
         "refit_report": report,
         "refit_trace": trace.csv(),
     }
+    return found, _rms(equilibria, design) <= weights.error_scale
 
 
 @dataclass(frozen=True, eq=False)

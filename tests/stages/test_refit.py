@@ -20,7 +20,7 @@ from fab4d.design.forward import Programming, balance, program, same_shape
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights, shape_error
 from fab4d.design.paths import change_density, follow_density
-from fab4d.design.problem import Problem
+from fab4d.design.problem import Problem, at_nodes
 from fab4d.design.reduced import Search
 from fab4d.errors import EquilibriumError
 from fab4d.io.scene import Goal, SolverSettings
@@ -101,6 +101,34 @@ def test_what_is_too_large_to_round_in_quadratic_elements_is_fitted_in_them(
     rows = list(csv.DictReader(io.StringIO(found["refit_trace"].decode())))
     carried = next(k for k, row in enumerate(rows) if row["phase"] == "carried over")
     assert float(rows[-1]["rms_mm"]) < 0.9 * float(rows[carried]["rms_mm"])
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "out_of_reach", "wanted", "order"),
+    [
+        (0.8, 1.25, "auto", 2),
+        (1e-3, 1.25, "auto", 1),
+        (1e-3, 1.25, "quadratic", 2),
+        (0.8, 0.0, "auto", 2),
+    ],
+)
+def test_a_design_far_from_the_tolerance_is_fitted_in_linear_elements(
+    inputs: Artifacts,
+    monkeypatch: pytest.MonkeyPatch,
+    tolerance: float,
+    out_of_reach: float,
+    wanted: str,
+    order: int,
+) -> None:
+    """Unless it meets the tolerance there after all, or quadratic ones are asked for or have found it."""
+    monkeypatch.setattr(refit, "OUT_OF_REACH", out_of_reach)
+    profile = PROFILE | {"goal": Goal(tolerance=tolerance, max_forces=4), "solver": SolverSettings(element=wanted)}
+    found = refit.run(inputs, profile, SilentMonitor())
+    assert equilibria_of(inputs, found).problem.body.order == order
+    assert found["refit_report"]["left_out"] == ([refit.NOT_QUADRATIC] if order == 1 else [])
+    quadratic = problem_of(inputs["mesh"], PROFILE["materials"], "quadratic")
+    x = at_nodes(quadratic, inputs["relaxed"]["x"])
+    assert not refit._missed_by_far(inputs | {"relaxed": inputs["relaxed"] | {"x": x}}, profile)
 
 
 def test_a_design_that_quadratic_elements_do_not_hold_is_loaded_in_them(
