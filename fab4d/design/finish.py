@@ -30,11 +30,10 @@ from fab4d.mesh.tetmesh import FloatArray
 MOST_HELD_BACK, LITTLE_DECIDED = 3, 0.9
 # After so many steps in a row that are not taken, or only with the largest damping, the undecided tets are decided by
 # and by, the surest first, up to this share of all: that takes fewer steps than to raise the price of all of them until
-# the last is 0 or 1, and leaves a smaller error. So they are at once where the median shape is kept clear of unstable
-# states.
+# the last is 0 or 1, and leaves a smaller error. More than that is left to the steps, until they come to nothing.
 HARD_STEPS, LAST_SHARE = 2, 0.7
-# Whatever its share, what is undecided is so where a design came near unstable states, or where other elements have
-# been searched themselves: steps are hard because of that.
+# Whatever its share, what is undecided is so where a design came near unstable states, there without any steps before,
+# or where other elements have been searched themselves: steps are hard because of that.
 ANY_SHARE = 1.0
 # It is rounded in half the steps of a search from the start.
 ROUND_GROWTH = 2.5
@@ -45,7 +44,7 @@ class Rounding:
     """How a design that was carried over is relaxed further and rounded.
 
     relax_iterations : steps of relaxing at most
-    most_left : share of all tets, at most, that is decided by and by
+    most_left : share of all tets, at most, that is decided by and by before steps have come to nothing
     """
 
     relax_iterations: int
@@ -75,7 +74,7 @@ def carried_over(
     rho (m,); x, y (n or N, 3) median and final shape; forces (K, 3). None where these find no equilibrium near it.
     """
     problem = equilibria.problem
-    x, y = (shape if len(shape) == problem.n_nodes else at_nodes(problem, shape) for shape in (x, y))
+    x, y = at_nodes(problem, x), at_nodes(problem, y)
     held = equilibria.patches.mean(x) + RIG_COMPLIANCE * forces
     median = equilibria.solve_median(rho, held, x, forces, SEARCH_TOLERANCE, 100)
     if not median.solution.converged:

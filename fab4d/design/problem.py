@@ -97,8 +97,9 @@ def build_problem(
 
 
 def at_nodes(problem: Problem, x: FloatArray) -> FloatArray:
-    """Vertex positions (n, 3) at all nodes (N, 3) of the problem: mid-edge nodes half-way."""
-    if problem.body.order == 1:
+    """Vertex positions (n, 3) at all nodes (N, 3) of the problem: mid-edge nodes half-way; those of all nodes as they
+    are."""
+    if problem.body.order == 1 or len(x) == problem.n_nodes:
         return x
     edges, _ = unique_edges(problem.body.elements[:, :4])
     return with_midpoints(x, edges)

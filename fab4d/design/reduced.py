@@ -361,15 +361,12 @@ def _undecided(rho: FloatArray) -> BoolArray:
     return (rho > UNDECIDED[0]) & (rho < UNDECIDED[1])
 
 
-def decided(at: Search, settings: ReducedSettings, most: float = 1.0) -> Search | None:
+def decided(at: Search, settings: ReducedSettings) -> Search | None:
     """The state with all its densities rounded, as it is where the share that `settings` allow or less is undecided.
 
-    None where more than the share `most` is left, or no equilibrium holds them.
+    None where no equilibrium holds them.
     """
-    left = undecided_fraction(at.design.rho)
-    if left <= settings.undecided_fraction:
-        return at
-    return None if left > most else decided_by_and_by(at, settings)
+    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else decided_by_and_by(at, settings)
 
 
 def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lambda at: None) -> Search | None:  # noqa: ARG005

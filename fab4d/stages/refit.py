@@ -56,8 +56,8 @@ FEW_STEPS = 3
 CLEARLY_WORSE = 1.1
 # What is predicted beyond this multiple of the error before is as likely a failure of the prediction.
 NOT_TRUE = 3.0
-# Labels that err by more than this multiple of what was predicted of them, fitted, tell that others may be better than
-# predicted ones: of a thin limb, flips that each do little together take what holds it.
+# Where the best labels, fitted, err by more than this multiple of the least error predicted, others may be better than
+# predicted: of a thin limb, flips that each do little together take what holds it.
 FAR_FROM_TRUE = 2.0
 # Squeezed surfaces count for less than in the search: what that kept from the limit of their stability, labels that are
 # 0 or 1 take up, and positions that made up for it would miss the temporary shape by more.
@@ -88,10 +88,11 @@ def run(inputs: Mapping[str, Any], profile: Mapping[str, Any], monitor: Monitor)
 def _missed_by_far(inputs: Mapping[str, Any], profile: Mapping[str, Any]) -> bool:
     """Whether the design was found in linear elements, and misses the tolerance by far there."""
     mesh, relaxed = inputs["mesh"], inputs["relaxed"]
+    if element_of(mesh, relaxed["x"]) != "linear":
+        return False
     problem = problem_of(mesh, profile["materials"], "linear")
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
-    rms = float(relaxed["relaxed_rms"]) / problem.length
-    return element_of(mesh, relaxed["x"]) == "linear" and rms > OUT_OF_REACH * weights.error_scale
+    return float(relaxed["relaxed_rms"]) / problem.length > OUT_OF_REACH * weights.error_scale
 
 
 def _fitted_in(
@@ -203,7 +204,6 @@ def _printed_designs(
     before, found = _carried(equilibria, relaxed, relaxed["rho"]), list[_Printed]()
     if before is None:
         x, forces = relaxed["x"] / problem.length, relaxed["patch_force"] / problem.force
-        x = x if len(x) == problem.n_nodes else at_nodes(problem, x)
         design = _loaded_from_rest(equilibria, rho, x, forces)
         yield _Printed(design, design)
         return
@@ -243,9 +243,10 @@ def _ways(
     problem, few = equilibria.problem, equilibria.problem.n_tets <= FEW_TETS
     most = NOT_TRUE * _rms(equilibria, before)
     flips, tried, rounded = influence_near(equilibria, before, smp, weights), list[BoolArray](), before.rho > 0.5
-    best, promised, came_true = np.inf, np.inf, True
+    best = promised = np.inf
     for labels in _repairs(problem, flips, rounded, smp, settings):
         left = 0.0 if flips is None else error_left(flips, rounded, labels)
+        came_true = best <= FAR_FROM_TRUE * promised
         worse = left <= most and (left >= best or (came_true and left > CLEARLY_WORSE * promised))
         if (worse and not few) or any((labels == other).all() for other in tried):
             continue
@@ -253,9 +254,8 @@ def _ways(
         ahead = None if flips is None else predicted(flips, rounded, labels)
         followed = _followed(equilibria, before, labels, weights, ahead)
         if followed is not None:
-            rms = _rms(equilibria, followed.fitted)
-            came_true = came_true and rms <= FAR_FROM_TRUE * left
-            best, promised = min(best, rms), min(promised, left)
+            best = min(best, _rms(equilibria, followed.fitted))
+            promised = min(promised, left)
         yield followed
 
 
@@ -444,13 +444,13 @@ def _in_elements_of(problem: Problem, at: Search) -> Search:
         return carried
     patches, median = at.equilibria.patches, at.design.median
     equilibria = Equilibria(problem, patches_from_faces(problem, patches.centers, patches.faces, patches.offsets))
-    design = _loaded_from_rest(equilibria, at.design.rho, at_nodes(problem, median.x), median.forces)
+    design = _loaded_from_rest(equilibria, at.design.rho, median.x, median.forces)
     return replace(at, equilibria=equilibria, design=design)
 
 
 def _loaded_from_rest(equilibria: Equilibria, rho: FloatArray, x: FloatArray, forces: FloatArray) -> Design:
-    """The labels rho (m,) where loading to the median shape x (N, 3) ends, or as far as that comes."""
-    return _programmed(program(equilibria, rho, x, forces), rho)
+    """The labels rho (m,) where loading to the median shape x (n or N, 3) ends, or as far as that comes."""
+    return _programmed(program(equilibria, rho, at_nodes(equilibria.problem, x), forces), rho)
 
 
 def _carried(equilibria: Equilibria, relaxed: Mapping[str, np.ndarray], rho: FloatArray) -> Design | None:

@@ -449,8 +449,8 @@ def test_other_ways_to_printable_labels_are_left_out_where_flips_reach_the_goal(
 def test_labels_that_are_predicted_to_be_no_better_than_what_was_found_are_not_followed(
     inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, promises: tuple[float, ...], ways: list[int]
 ) -> None:
-    """Nor those predicted to be clearly worse than the best that was followed, unless that came to more than twice what
-    was predicted. All come to 1, which is too much.
+    """Nor those predicted to be clearly worse than the best that was followed, unless more than twice of what was
+    predicted came of that. All come to 1, which is too much.
 
     Of few tets all are, and so are those of which more is predicted than can be true.
     """
