@@ -1,4 +1,4 @@
-"""What keeps a scene from its goal, where even relaxed designs miss it."""
+"""What keeps a scene from its goal where even relaxed designs miss it, and a design from what the rig can do."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import force_excess, pushes, shape_error, stretch_excess
+from fab4d.design.patches import Patches, outward_normals
 from fab4d.design.problem import Problem
 from fab4d.design.reduced import ReducedSettings, Search, relaxed
 from fab4d.errors import EquilibriumError
@@ -77,3 +79,19 @@ def _outlook(problem: Problem, tolerance: float, more: MorePoints) -> str:
 def reached(found: Search) -> float:
     """The RMS error, L0, of the relaxed design, or of the rounded one where rounding has gone on to lower it."""
     return min(found.relaxed_rms, found.rms)
+
+
+def limit_reasons(problem: Problem, patches: Patches, design: Design, profile: Mapping[str, Any]) -> list[str]:
+    """What of the rig's limits the design does not keep."""
+    rig, forces = profile["rig"], design.median.forces * problem.force
+    sizes = np.linalg.norm(forces, axis=1)
+    reasons = []
+    if len(sizes) and sizes.max() > rig.max_force * (1 + 1e-3):
+        point = int(sizes.argmax())
+        reasons.append(f"point {point + 1} needs {sizes[point]:.4g} N, the rig gives {rig.max_force:g} N")
+    if rig.pull_only and patches.count:
+        outward = (forces * outward_normals(patches, design.median.x)).sum(axis=1)
+        if (outward < 0).any():
+            pushed = ", ".join(str(k + 1) for k in np.flatnonzero(outward < 0))
+            reasons.append(f"the rig only pulls, but points {pushed} are pushed")
+    return reasons

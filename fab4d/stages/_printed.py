@@ -18,8 +18,10 @@ from fab4d.errors import EquilibriumError
 from fab4d.fabrication.labels import ambiguous_fraction, isolated_fraction, rounded_labels
 from fab4d.io.scene import Goal, PrinterCard
 from fab4d.mesh.tetmesh import BoolArray
+from fab4d.stages._flips import flip_settings
+from fab4d.stages._limits import limit_reasons
 from fab4d.stages._repair import repaired
-from fab4d.stages.refit import FEW_STEPS, flip_settings, limit_reasons
+from fab4d.stages._ways import FEW_STEPS
 from fab4d.stages.threshold import acceptance_reasons
 
 # Flips win back a part of what rounding costs: beyond this multiple of the tolerance they do not reach it.

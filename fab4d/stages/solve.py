@@ -17,13 +17,13 @@ from fab4d.stages._coarse import MANY_TETS, coarse_for
 from fab4d.stages._design import Trace, patch_arrays, problem_of, tau_seconds, tolerance_of
 from fab4d.stages._element import elements_for
 from fab4d.stages._finish import finished
+from fab4d.stages._flips import flip_settings
 from fab4d.stages._least import least_smp
 from fab4d.stages._limits import limited_by
 from fab4d.stages._repair import MORE_REPAIRS, repaired
 from fab4d.stages._search import search_from
 from fab4d.stages._settings import search_settings
 from fab4d.stages.monitor import Monitor, Prefixed
-from fab4d.stages.refit import flip_settings
 
 LEFT_OUT = [{"what": "iterative linear solver", "why": "the direct one factors this mesh in memory"}]
 # A coarse mesh is searched from so many times more other points where the usual ones nearly do: what is found there
