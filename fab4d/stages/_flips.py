@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from fab4d.design.flips import FlipSettings
-from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.problem import Problem
 from fab4d.fabrication.annealing import annealer
 from fab4d.io.scene import Goal, PrinterCard
@@ -30,16 +28,17 @@ LOW_ERROR, MANY_DOFS = 0.15, 40_000
 
 
 def fit_flips(
-    inputs: Mapping[str, Any], profile: Mapping[str, Any], problem: Problem, weights: ObjectiveWeights
+    problem: Problem, mesh: Mapping[str, np.ndarray], printer: PrinterCard, goal: Goal, relaxed_rms: float, limit: float
 ) -> FlipSettings:
-    """The flips of stage refit in the elements of `problem`."""
-    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
-    down_to = flipped_down_to(relaxed_rms, weights.error_scale, problem.n_tets)
-    settings = flip_settings(inputs["mesh"], profile["printer"], profile["goal"], down_to)
+    """The flips of stage refit in the elements of `problem`.
+
+    relaxed_rms, limit : RMS error of the relaxed design and the tolerance, L0
+    """
+    settings = flip_settings(mesh, printer, goal, flipped_down_to(relaxed_rms, limit, problem.n_tets))
     low = LOW_ERROR if 3 * problem.n_nodes <= MANY_DOFS else 1.0
-    settings = replace(settings, tolerance=weights.error_scale, low_rms=low * weights.error_scale)
-    few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * weights.error_scale
-    return replace(settings, rounds=FEW_ROUNDS) if few else settings
+    few = problem.n_tets > MANY_TETS or relaxed_rms > OUT_OF_REACH * limit
+    rounds = FEW_ROUNDS if few else settings.rounds
+    return replace(settings, tolerance=limit, low_rms=low * limit, rounds=rounds)
 
 
 def flipped_down_to(relaxed_rms: float, tolerance: float, n_tets: int) -> float:

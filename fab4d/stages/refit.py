@@ -72,7 +72,8 @@ def _fitted_in(
     trace = Trace(problem, mesh, monitor, tau_s)
     weights = objective_weights(problem, profile["goal"], profile["weights"], profile["rig"], profile["materials"])
     weights = weights.replace(least_stretch=LEAST_STRETCH, lam_squeeze=LAM_SQUEEZE)
-    settings = fit_flips(inputs, profile, rounding, weights)
+    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
+    settings = fit_flips(rounding, mesh, profile["printer"], profile["goal"], relaxed_rms, weights.error_scale)
     fit = _fitted(rounding, problem, inputs["relaxed"], smp, weights, settings, trace)
     fit = replace(fit, design=polished(fit.equilibria, fit.design))
     trace.add("refit", Search(fit.equilibria, fit.design))

@@ -37,7 +37,9 @@ def fit_of(inputs: Artifacts) -> tuple[Equilibria, ObjectiveWeights, FlipSetting
     """What stage refit makes of its inputs, in linear elements."""
     problem = problem_of(inputs["mesh"], PROFILE["materials"], "linear")
     weights = objective_weights(problem, *(PROFILE[name] for name in ("goal", "weights", "rig", "materials")))
-    settings = fit_flips(inputs, PROFILE, problem, weights)
+    relaxed_rms = float(inputs["relaxed"]["relaxed_rms"]) / problem.length
+    given = inputs["mesh"], PROFILE["printer"], PROFILE["goal"], relaxed_rms, weights.error_scale
+    settings = fit_flips(problem, *given)
     return Equilibria(problem, patches_of(problem, inputs["relaxed"])), weights, settings
 
 
