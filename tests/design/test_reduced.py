@@ -12,7 +12,7 @@ from fab4d.design import gauss_newton, reduced
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.forward import balance, program
 from fab4d.design.gauss_newton import Design
-from fab4d.design.objective import ObjectiveWeights, shape_error, smoothness_matrix
+from fab4d.design.objective import PULL_MARGIN, ObjectiveWeights, shape_error, smoothness_matrix
 from fab4d.design.patches import Patches, build_patches, outward_normals, patches_from_faces, spread_centers
 from fab4d.design.paths import change_density
 from fab4d.design.problem import Problem, build_problem
@@ -262,13 +262,14 @@ def test_phases_follow_each_other(searched: list[Search]) -> None:
 
 @pytest.mark.parametrize("pull_only", [False, True])
 def test_a_rig_that_only_pulls_is_asked_to_pull_only(pull_only: bool) -> None:
-    """Where it may, the same scene is pushed at two of its points."""
+    """Where it may, the same scene is pushed at two of its points. The penalty gives way by about its margin."""
     problem = bar(cells=(6, 2, 2), degrees=45.0)
     weights = ObjectiveWeights(error_scale=5e-3, lam_SMP=0.05, lam_smooth=0.3, pull_only=pull_only)
     found = solve_reduced(problem, settings_for(problem, n_points=6, weights=weights), lambda at: None)  # noqa: ARG005
     median = found.design.median
     outward = (median.forces * outward_normals(found.equilibria.patches, median.x)).sum(axis=1)
-    assert (outward > 0).all() == pull_only
+    usual = np.sqrt((median.forces**2).sum(axis=1).mean())
+    assert (outward > -PULL_MARGIN * usual).all() == pull_only
     assert rms(problem, found.design) < 5e-3
 
 
