@@ -10,7 +10,6 @@ from fab4d.design.exchange import held_apart
 from fab4d.design.forward import Programming, program, same_shape
 from fab4d.design.gauss_newton import Design, build_model
 from fab4d.design.objective import ObjectiveWeights, smoothness_matrix
-from fab4d.design.problem import Problem
 from fab4d.design.reduced import Search
 from fab4d.stages._bring_up import OUT_OF_REACH
 from fab4d.stages._design import Trace
@@ -35,6 +34,11 @@ class Fit:
     loading: Programming | None = None
     missed: float = np.inf
 
+    @property
+    def rms(self) -> float:
+        """RMS error of the design, L0."""
+        return rms_of(self.equilibria, self.design)
+
 
 def reachable_fit(
     equilibria: Equilibria, design: Design, weights: ObjectiveWeights, radius: float, polish: Polish, trace: Trace
@@ -47,14 +51,14 @@ def reachable_fit(
     far. The state nearest to the temporary shape among those that loading ended in; the last fit where no loading went
     all the way.
     """
-    ends, missed = list[tuple[float, Fit]](), np.inf
+    ends, missed = list[Fit](), np.inf
     for fits in range(1, MOST_FITS + 1):
         done = program(equilibria, design.rho, design.median.x, design.median.forces)
         end = programmed(done, design.rho)
         fitted_rms, rms = rms_of(equilibria, design), rms_of(equilibria, end)
         there, whole = same_shape(done, design.median.x), done.loaded == done.unloaded == 1.0
         if whole:
-            ends.append((rms, Fit(equilibria, end, loading=done)))
+            ends.append(Fit(equilibria, end, loading=done))
         if not there:
             missed = min(missed, fitted_rms)
             trace.add("reached", Search(equilibria, end))
@@ -64,7 +68,7 @@ def reachable_fit(
         if fits < MOST_FITS:
             equilibria, design = _begun_again(equilibria, design, end, whole, weights, radius)
             design = polish(equilibria, design)
-    nearest = min(ends, key=lambda each: each[0])[1] if ends else Fit(equilibria, design)
+    nearest = min(ends, key=lambda each: each.rms, default=Fit(equilibria, design))
     return replace(nearest, fits=fits, missed=missed)
 
 
@@ -74,7 +78,7 @@ def other_fit(fit: Fit, weights: ObjectiveWeights, radius: float, polish: Polish
     if design is fit.design:
         return fit
     after = reachable_fit(fit.equilibria, design, weights, radius, polish, trace)
-    best = min(after, fit, key=lambda each: (each.loading is None, rms_of(each.equilibria, each.design)))
+    best = min(after, fit, key=lambda each: (each.loading is None, each.rms))
     return replace(best, fits=fit.fits + after.fits, missed=min(fit.missed, after.missed))
 
 
@@ -90,12 +94,12 @@ def _begun_again(
     return held_apart(equilibria, weights, model, design, end.median.x, radius) or (equilibria, end)
 
 
-def not_reached(problem: Problem, fit: Fit, weights: ObjectiveWeights) -> list[str]:
+def not_reached(fit: Fit, weights: ObjectiveWeights) -> list[str]:
     """Why the design misses the tolerance where a fit meets it."""
-    rms = rms_of(fit.equilibria, fit.design)
-    if fit.loading is None or rms <= weights.error_scale or fit.missed > weights.error_scale:
+    if fit.loading is None or fit.rms <= weights.error_scale or fit.missed > weights.error_scale:
         return []
+    missed_mm = fit.missed * fit.equilibria.problem.length
     return [
-        f"its points hold two shapes: one is {fit.missed * problem.length:.3g} mm RMS off the temporary shape, but "
+        f"its points hold two shapes: one is {missed_mm:.3g} mm RMS off the temporary shape, but "
         "loading from the permanent shape ends in the other; allow more points ([goal] max_forces)"
     ]

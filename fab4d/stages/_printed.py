@@ -71,9 +71,8 @@ def refitted_in(problem: Problem, found: Search, printed: Design, weights: Objec
     carried = carried_in(problem, replace(found, design=printed))
     if carried is None:
         return np.inf
-    rms = shape_error(problem, carried.design.final.y).rms
-    if rms <= weights.error_scale:
-        return rms
+    if carried.rms <= weights.error_scale:
+        return carried.rms
     fitted = refit(carried.equilibria, carried.design, weights, lambda at: None, FEW_STEPS)  # noqa: ARG005
     return shape_error(problem, fitted.final.y).rms
 

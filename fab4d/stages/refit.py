@@ -81,12 +81,11 @@ def _fitted_in(
         "tau_s": tau_s,
         "fits": fit.fits,
         "flipped_fraction": float(problem.volume_fractions[(fit.design.rho > 0.5) != smp].sum()),
-        "reasons": limit_reasons(problem, fit.equilibria.patches, fit.design, profile)
-        + not_reached(problem, fit, weights),
+        "reasons": limit_reasons(problem, fit.equilibria.patches, fit.design, profile) + not_reached(fit, weights),
         "left_out": elements.left_out,
     }
     found = _fit_arrays(problem, mesh, fit) | {"refit_report": report, "refit_trace": trace.csv()}
-    return found, rms_of(fit.equilibria, fit.design) <= weights.error_scale
+    return found, fit.rms <= weights.error_scale
 
 
 def _fitted(
@@ -118,10 +117,10 @@ def _fitted(
         equilibria, design = carried.equilibria, polish(carried.equilibria, carried.design)
     radius = float(relaxed["patch_radius"]) / problem.length
     fit = reachable_fit(equilibria, design, weights, radius, polish, trace)
-    if flips_last and rms_of(fit.equilibria, fit.design) > weights.error_scale:
+    if flips_last and fit.rms > weights.error_scale:
         weights = free
         fit = other_fit(fit, weights, radius, _polish(weights, replace(settings, rounds=0), trace), trace)
-    if flips_last and rms_of(fit.equilibria, fit.design) > settings.target_rms:
+    if flips_last and fit.rms > settings.target_rms:
         fit = other_fit(fit, weights, radius, _polish(weights, settings, trace), trace)
     return fit
 
