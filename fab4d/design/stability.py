@@ -11,17 +11,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from fab4d.design.equilibria import RIG_COMPLIANCE, Equilibria, Median
 from fab4d.design.objective import ObjectiveWeights
 from fab4d.design.sensitivity import forces_by_density
 from fab4d.mesh.tetmesh import FloatArray
+from fab4d.solvers.block_lanczos import end_modes
 from fab4d.solvers.linear import Factor, SingularMatrixError, product
 
 # So many modes are looked at, those nearest to instability.
 MODES = 6
-MODE_TOLERANCE, MOST_RESTARTS = 1e-2, 50
+MODE_TOLERANCE, BLOCK, MOST_BLOCKS = 1e-2, 8, 24
 # Third derivatives are differences over a displacement that changes the edges of no tet by more than this share.
 DIFFERENCE = 1e-4
 
@@ -57,36 +57,22 @@ def _found(equilibria: Equilibria, rho: FloatArray, x: FloatArray, factor: Facto
 
     def stiffness(u: FloatArray) -> FloatArray:
         # The forces that the rig answers with leave nothing of the constraints' rows.
-        rig = -W @ u.reshape(x.shape) / RIG_COMPLIANCE
-        return product(pattern.indptr, pattern.indices, data, np.concatenate([u.ravel(), rig.ravel()]))[:n]
+        rig = -(W @ u.reshape(len(x), -1)).reshape(-1, u.shape[1]) / RIG_COMPLIANCE
+        return product(pattern.indptr, pattern.indices, data, np.concatenate([u, rig]))[:n]
 
-    def compliance(load: FloatArray) -> FloatArray:
-        return factor.solve(np.concatenate([load.ravel(), np.zeros(pattern.n_dofs - n)]))[:n]
+    def compliance(loads: FloatArray) -> FloatArray:
+        return factor.solve_many(np.concatenate([loads, np.zeros((pattern.n_dofs - n, loads.shape[1]))]))[:n]
 
-    positive, inverse = (LinearOperator((n, n), matvec=each, dtype=np.float64) for each in (stiffness, compliance))
-    load = np.random.default_rng(0).standard_normal(n)
-    load[equilibria.held_mask.fixed] = 0.0
-    start = compliance(load)
+    loads = np.random.default_rng(0).standard_normal((n, BLOCK))
+    loads[equilibria.held_mask.fixed] = 0.0
     unstable = min(max(factor.n_negative - 3 * equilibria.patches.count, 0), MODES)
-    ends = (unstable, "SA"), (MODES - unstable, "LA")
-    found = [_lanczos(positive, inverse, start, count, which) for count, which in ends if count]
-    ratios, shapes = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+    # A mode's eigenvalue of the inverse is the inverse of its ratio.
+    modes = end_modes(
+        compliance, stiffness, compliance(loads), unstable, MODES - unstable, MODE_TOLERANCE, MOST_BLOCKS
+    ).found
+    ratios = 1 / modes.values
     order = np.argsort(ratios)
-    return SoftModes(ratios[order], shapes.T[order].reshape(-1, *x.shape))
-
-
-def _lanczos(
-    positive: LinearOperator, inverse: LinearOperator, start: FloatArray, count: int, which: str
-) -> tuple[FloatArray, FloatArray]:
-    """Ratios (k,) and shapes (n, k), by `which` end of the inverse's spectrum; those found if not all are."""
-    try:
-        # Inverted about 0 only the inverse is used, so that the first operator need not be K.
-        return eigsh(
-            positive, count, M=positive, sigma=0.0, which=which, OPinv=inverse, v0=start,
-            tol=MODE_TOLERANCE, maxiter=MOST_RESTARTS,
-        )  # fmt: skip
-    except ArpackNoConvergence as error:
-        return error.eigenvalues, error.eigenvectors
+    return SoftModes(ratios[order], modes.vectors.T[order].reshape(-1, *x.shape))
 
 
 @dataclass(frozen=True, eq=False)

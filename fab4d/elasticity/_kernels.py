@@ -302,14 +302,15 @@ def _frame_block(na, nb, scaling, same, swapped, block):
 def _scatter_rotated(U, block, column, r, indptr, data):
     """Adds U block U^T as the r-th block below the diagonal of three columns, or on the diagonal (r < 0)."""
     for k in range(3):
+        b0 = block[0, 0] * U[k, 0] + block[0, 1] * U[k, 1] + block[0, 2] * U[k, 2]
+        b1 = block[1, 0] * U[k, 0] + block[1, 1] * U[k, 1] + block[1, 2] * U[k, 2]
+        b2 = block[2, 0] * U[k, 0] + block[2, 1] * U[k, 1] + block[2, 2] * U[k, 2]
         if r < 0:
             base, start = indptr[column + k] - k, k
         else:
             base, start = indptr[column + k] + 3 - k + 3 * r, 0
         for i in range(start, 3):
-            for p in range(3):
-                for q in range(3):
-                    data[base + i] += U[i, p] * block[p, q] * U[k, q]
+            data[base + i] += U[i, 0] * b0 + U[i, 1] * b1 + U[i, 2] * b2
 
 
 @njit(cache=True, nogil=True)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bars import CARD, CLAMPED, held_design, mixed_density
-from scipy.sparse.linalg import ArpackNoConvergence
 from scipy.spatial.transform import Rotation
 from shapes.boxes import box
 
@@ -229,13 +228,8 @@ def test_modes_are_sought_once_for_a_median_shape(monkeypatch: pytest.MonkeyPatc
 def test_modes_that_are_not_found_in_time_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = strut()
     equilibria, median = pushed(problem, even(problem), 0.006)
-    shape = np.ones((median.x.size, 1))
-    given_up = ArpackNoConvergence("few are found", np.array([0.5]), shape)
-
-    def give_up(*_: object, **__: object) -> None:
-        raise given_up
-
-    monkeypatch.setattr(stability, "eigsh", give_up)
-    few = soft_modes(equilibria, even(problem), median)
-    assert few.ratios.tolist() == [0.5]
-    np.testing.assert_array_equal(few.shapes, shape.reshape(1, -1, 3))
+    every = soft_modes(equilibria, even(problem), median)
+    monkeypatch.setattr(stability, "MOST_BLOCKS", 2)
+    few = soft_modes(equilibria, even(problem), replace(median))
+    assert 0 < len(few.ratios) < len(every.ratios) == stability.MODES
+    np.testing.assert_allclose(few.ratios, every.ratios[: len(few.ratios)], rtol=1e-2)
