@@ -19,6 +19,7 @@ from fab4d.design.sensitivity import linearise
 from fab4d.errors import EquilibriumError
 from fab4d.mesh.rigid import best_rigid_motion
 from fab4d.mesh.tetmesh import BoolArray
+from fab4d.solvers import threads
 
 WEIGHTS = ObjectiveWeights(error_scale=1e-3)
 Start = tuple[Equilibria, Design]
@@ -35,6 +36,12 @@ def start() -> Start:
     problem = replace(made, X_temp=wanted @ R.T + t)
     equilibria = Equilibria(problem, patches)
     return equilibria, refit(equilibria, held_design(equilibria, smp.astype(float), made.X_temp), WEIGHTS, unseen)
+
+
+@pytest.fixture(autouse=True)
+def one_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On several cores some steps are tried for nothing; these tests count those that are needed."""
+    monkeypatch.setattr(threads, "usable_cores", lambda: 1)
 
 
 def unseen(at: Search) -> None:
@@ -214,3 +221,22 @@ def test_a_path_that_ends_before_is_refused(start: Start, monkeypatch: pytest.Mo
         follow_density(equilibria, design, 1 - design.rho, WEIGHTS, ahead)
     with pytest.raises(EquilibriumError, match="no equilibrium"):
         change_density(equilibria, design, 1 - design.rho)
+
+
+@pytest.mark.parametrize("ahead_fails", [False, True])
+def test_steps_that_are_tried_at_once_lead_to_the_same_design(
+    start: Start, monkeypatch: pytest.MonkeyPatch, ahead_fails: bool
+) -> None:
+    """To the last bit, where the whole way is found at once and where models lead on from halfway."""
+    equilibria, design = start
+    labels = other_labels(equilibria, design)
+    ahead, rho = ahead_of(equilibria, design, labels), labels.astype(float)
+    if ahead_fails:
+        half = change_density(equilibria, design, 0.5 * (design.rho + rho))
+        monkeypatch.setattr(paths, "_at_once", lambda *_: (half, 0.5))
+    found = list[Design]()
+    for cores in (1, 2):
+        monkeypatch.setattr(threads, "usable_cores", lambda cores=cores: cores)
+        found.append(follow_density(equilibria, design, rho, WEIGHTS, ahead))
+    np.testing.assert_array_equal(found[0].final.y, found[1].final.y)
+    np.testing.assert_array_equal(found[0].median.x, found[1].median.x)
