@@ -173,7 +173,7 @@ def rounded_on(relaxed: Relaxed, watch: Watch, most_left: float) -> Search | Non
         hard = hard + 1 if _is_hard(at) else 0
         held_back = held_back + 1 if hard and not decided_much else 0
         by_and_by = hard >= HARD_STEPS
-    return decided(at, settings)
+    return decided(at, settings, partial(watch, Phase.ROUND.value))
 
 
 def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:

@@ -141,7 +141,7 @@ def solve_reduced(problem: Problem, settings: ReducedSettings, watch: Watch, sta
     while at.phase is not Phase.DONE:
         at = STEPS[at.phase](at, settings, L)
         watch(at)
-    return decided(at, settings) or at
+    return decided(at, settings, watch) or at
 
 
 def relaxed(problem: Problem, settings: ReducedSettings, watch: Watch, start: Search | None = None) -> Search:
@@ -361,15 +361,17 @@ def _undecided(rho: FloatArray) -> BoolArray:
     return (rho > UNDECIDED[0]) & (rho < UNDECIDED[1])
 
 
-def decided(at: Search, settings: ReducedSettings) -> Search | None:
+def decided(at: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
     """The state with all its densities rounded, as it is where the share that `settings` allow or less is undecided.
 
     None where no equilibrium holds them.
     """
-    return at if undecided_fraction(at.design.rho) <= settings.undecided_fraction else decided_by_and_by(at, settings)
+    if undecided_fraction(at.design.rho) <= settings.undecided_fraction:
+        return at
+    return decided_by_and_by(at, settings, watch)
 
 
-def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch = lambda at: None) -> Search | None:  # noqa: ARG005
+def decided_by_and_by(at: Search, settings: ReducedSettings, watch: Watch) -> Search | None:
     """The surest densities rounded first; the others and the held positions make up for it.
 
     watch : is shown the state after each step

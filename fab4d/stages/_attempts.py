@@ -161,11 +161,17 @@ def _prints_better(best: Search, printed: _Linear, problem: Problem, rms: float,
 
 
 def _watch(attempt: int, start: Search | None, trace: Trace, monitor: Monitor, before_rounding: list[Search]) -> Watch:
-    """Keeps every state, and adds those that are about to be rounded to `before_rounding`."""
+    """Keeps every state, and adds those that are about to be rounded to `before_rounding`.
+
+    Tets that rounding leaves are decided from where it ended: a run that is stopped meanwhile goes on from there.
+    """
     phase = "start" if start is None else start.phase.value
 
     def watch(at: Search) -> None:
         nonlocal phase
+        if phase == Phase.DONE.value:
+            trace.add(Phase.ROUND.value, at)
+            return
         trace.add(phase, at)
         phase = at.phase.value
         monitor.save(CHECKPOINT, _checkpoint(attempt, at, trace))

@@ -364,10 +364,14 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
     rho = np.round(last.design.rho)
     rho[::5] = np.abs(rho[::5] - np.linspace(0.4, 0.49, len(rho[::5])))
     ended = replace(last, design=change_density(last.equilibria, last.design, rho), phase=Phase.DONE)
+    shown: list[Search] = []
     at_once, by_and_by = (
         change_density(last.equilibria, ended.design, np.round(rho)),
-        decided(ended, settings_for(problem)),
+        decided(ended, settings_for(problem), shown.append),
     )
+    # Each step is shown, so that a stopped run goes on from there.
+    assert len(shown) > 2
+    assert by_and_by is shown[-1]
     assert by_and_by is not None
     assert set(np.unique(by_and_by.design.rho)) == {0.0, 1.0}
     assert (
@@ -430,7 +434,7 @@ def test_ways_to_decided_densities_stay_on_stable_states_where_the_median_shape_
 
     monkeypatch.setattr(reduced, "toward_density", watched)
     weights = settings_for(truth.problem).weights.replace(lam_stable=lam_stable, least_stable=0.1)
-    assert decided_by_and_by(undecided, settings_for(truth.problem, weights=weights)) is not None
+    assert decided_by_and_by(undecided, settings_for(truth.problem, weights=weights), lambda _: None) is not None
     assert len(stays) > 2
     assert set(stays[:-1]) == {lam_stable > 0}
 
@@ -445,7 +449,9 @@ def test_the_last_few_stay_undecided_where_no_equilibrium_leads_on(
     rho[:12] = np.abs(rho[:12] - np.linspace(0.3, 0.4, 12))
     lost_at(2, monkeypatch, last=9)
     monkeypatch.setattr(reduced, "LEFT_UNDECIDED", share)
-    found = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    found = decided_by_and_by(
+        replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem), lambda _: None
+    )
     assert (found is not None) is kept
     if found is not None:
         assert undecided_fraction(found.design.rho) == 6 / truth.problem.n_tets
@@ -459,7 +465,9 @@ def test_what_is_nearly_decided_stays_so_where_it_cannot_all_be(
     rho = np.abs(np.round(last.design.rho) - 1e-3)
     rho[:2] = 0.3
     lost_at(2, monkeypatch, last=2)
-    found = decided_by_and_by(replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem))
+    found = decided_by_and_by(
+        replace(last, design=replace(last.design, rho=rho)), settings_for(truth.problem), lambda _: None
+    )
     assert found is not None
     np.testing.assert_array_equal(found.design.rho, np.r_[0.0, 0.0, rho[2:]])
 

@@ -21,6 +21,7 @@ from fab4d.stages import _attempts, _bring_up, _coarse, _finish, _limits, _setti
 from fab4d.stages._design import Trace, problem_of
 from fab4d.stages._figures import limits_of
 from fab4d.stages._printed import Printed
+from fab4d.stages._search import search_from
 from fab4d.stages._settings import search_settings
 from fab4d.stages.monitor import SilentMonitor
 from fab4d.stages.solve import run
@@ -550,3 +551,16 @@ def test_a_coarse_search_that_was_stopped_goes_on(fine_bar: dict[str, np.ndarray
     assert {name.split("-")[0] for name in kept} == {"coarse"}
     again = run(inputs, profile, Keeping())
     np.testing.assert_array_equal(first["relaxed"]["rho"], again["relaxed"]["rho"])
+
+
+def test_tets_that_rounding_leaves_are_shown_and_decided_again_by_a_run_that_was_stopped(
+    bar: dict[str, np.ndarray], memory: type[Any]
+) -> None:
+    problem, monitor = problem_of(bar, PROFILE["materials"], "linear"), memory()
+    trace, rest = Trace(problem, bar, monitor, 1.0), at_rest(problem)
+    watch = _attempts._watch(0, None, trace, monitor, [])
+    ended = replace(rest, iteration=7)
+    for at in (replace(rest, phase=reduced.Phase.ROUND, iteration=6), ended, replace(rest, iteration=8)):
+        watch(at)
+    assert [row["phase"] for row in trace.rows] == ["start", "round", "round"]
+    assert search_from(problem, monitor.saved[_attempts.CHECKPOINT]).iteration == ended.iteration
