@@ -168,9 +168,14 @@ def test_what_hard_steps_leave_undecided_is_decided_by_and_by_whatever_its_share
     carried, settings = carried_in(quadratic, found), settings_for(quadratic)
     assert carried is not None
     shown: list[Search] = []
-    at = rounded_from(carried, settings, lambda _, at: shown.append(at), replace(OTHER_ELEMENTS, most_left=0.05))
-    assert undecided_fraction(shown[-1].design.rho) > 0.05
-    assert at is not None
+
+    def show(phase: str, at: Search) -> None:
+        if phase == Phase.ROUND.value:
+            shown.append(at)
+
+    at = rounded_from(carried, settings, show, replace(OTHER_ELEMENTS, most_left=0.05))
+    assert undecided_fraction(shown[0].design.rho) > 0.05
+    assert at is shown[-1]
     assert undecided_fraction(at.design.rho) <= settings.undecided_fraction
     assert shape_error(quadratic, at.design.final.y).rms < TOLERANCE
 
