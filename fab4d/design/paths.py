@@ -52,7 +52,7 @@ def toward_density(
 ) -> tuple[Design, float]:
     """As `change_density`, as far as the path leads: the design there, and its share of the way."""
     held = held_positions(equilibria, design.median)
-    return _along(design, 0.0, _by_unloading(equilibria, rho, held, stay), smallest, 3 * equilibria.problem.n_nodes)
+    return _along(equilibria, design, 0.0, _by_unloading(equilibria, rho, held, stay), smallest)
 
 
 def follow_density(
@@ -66,11 +66,9 @@ def follow_density(
     Raises EquilibriumError when the path ends before.
     """
     design, done = _at_once(equilibria, design, rho, ahead)
-    n_unknowns = 3 * equilibria.problem.n_nodes
-    design, done = _along(design, done, _by_models(equilibria, rho, weights), SMALLEST_STEP / FINER, n_unknowns)
+    design, done = _along(equilibria, design, done, _by_models(equilibria, rho, weights), SMALLEST_STEP / FINER)
     held = held_positions(equilibria, design.median) + (1.0 - done) * ahead.moves
-    by_unloading = _by_unloading(equilibria, rho, held, stay=True)
-    return _arrived(*_along(design, done, by_unloading, SMALLEST_STEP, n_unknowns))
+    return _arrived(*_along(equilibria, design, done, _by_unloading(equilibria, rho, held, stay=True), SMALLEST_STEP))
 
 
 def _at_once(equilibria: Equilibria, design: Design, rho: FloatArray, ahead: Ahead) -> tuple[Design, float]:
@@ -123,7 +121,7 @@ def _between(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
     return end if share == 1.0 else start + share * (end - start)
 
 
-def _along(design: Design, done: float, lead: Lead, smallest: float, n_unknowns: int) -> tuple[Design, float]:
+def _along(equilibria: Equilibria, design: Design, done: float, lead: Lead, smallest: float) -> tuple[Design, float]:
     """The last design that `lead` comes to from `done` on the way to 1, and where it is.
 
     A length that has failed is not tried again before BEFORE_LONGER steps of half of it have led on.
@@ -133,7 +131,8 @@ def _along(design: Design, done: float, lead: Lead, smallest: float, n_unknowns:
         lengths, tried = _halved(step, smallest), lead(design)
         aims = [min(1.0, done + length) for length in lengths]
         shares = [(aim - done) / (1.0 - done) for aim in aims]
-        found = first_found([partial(tried, share, failures) for failures, share in enumerate(shares)], n_unknowns)
+        tries = [partial(tried, share, failures) for failures, share in enumerate(shares)]
+        found = first_found(tries, 3 * equilibria.problem.n_nodes)
         if found is None:
             break
         failures, design = found

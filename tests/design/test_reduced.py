@@ -370,7 +370,6 @@ def test_rounded_by_and_by_the_rest_makes_up_for_it(truth: Truth, searched: list
         change_density(last.equilibria, ended.design, np.round(rho)),
         decided(ended, settings_for(problem), shown.append),
     )
-    # Each step is shown, so that a stopped run goes on from there.
     assert len(shown) > 2
     assert by_and_by is shown[-1]
     assert by_and_by is not None
