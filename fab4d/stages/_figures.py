@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from fab4d.fabrication.labels import isolated_fraction
 from fab4d.io.scene import Acceptance, Goal, RigCard
 from fab4d.materials.cards import MaterialCard
 from fab4d.mesh.measures import bounding_box_diagonal
@@ -33,7 +34,11 @@ def limits_of(goal: Goal, acceptance: Acceptance, rig: RigCard, shapes: metrics.
 def figures_of(
     inputs: Mapping[str, Any], materials: MaterialCard, shapes: metrics.Shapes, smp: np.ndarray
 ) -> dict[str, Any]:
-    """The figures of report.json that a verdict hangs on, and those beside them."""
+    """The figures of report.json that a verdict hangs on, and those beside them.
+
+    The share of isolated tets is that of the labels smp (m,) that are printed; stage `threshold` has checked the design
+    that they come from.
+    """
     mesh, threshold, verify = inputs["mesh"], inputs["threshold_report"] or {}, inputs["verify_report"] or {}
     mass, cost = metrics.mass_and_cost(mesh, smp, materials)
     return {
@@ -43,7 +48,7 @@ def figures_of(
         "smp_fraction": metrics.smp_fraction(mesh, smp),
         "forces": metrics.force_count(inputs["state"]),
         "ambiguous_fraction": threshold.get("ambiguous_fraction"),
-        "isolated_fraction": threshold.get("isolated_fraction"),
+        "isolated_fraction": isolated_fraction(mesh["tets"], smp) if threshold else None,
         "fixity": metrics.fixity(shapes),
         "undesired_deformation": metrics.undesired_deformation(shapes),
         "equilibrium_residual": verify.get("equilibrium_residual", {"median": None, "final": None}),

@@ -7,6 +7,7 @@ import pytest
 
 from fab4d.io.cards import load_material, load_rig
 from fab4d.io.scene import Acceptance, Goal
+from fab4d.mesh.topology import face_table
 from fab4d.stages import judge
 from fab4d.stages.monitor import SilentMonitor
 
@@ -49,3 +50,15 @@ def test_without_a_tolerance_a_small_motion_has_to_be_made(mesh):
 @pytest.mark.parametrize("name", [name for name in judge.REPORTS if name != "verify_report"])
 def test_what_an_earlier_stage_says_rejects(mesh, name):
     assert verdict(mesh, 0.0, **{name: {"reasons": ["it leaks"]}})["reasons"] == ["it leaks"]
+
+
+@pytest.mark.parametrize(("count", "rejected"), [(1, True), (2, False)])
+def test_isolated_tets_that_are_printed_reject(mesh, count, rejected):
+    """Flips come after the labels that stage threshold judges."""
+    first, second = face_table(mesh["tets"]).interior_tets[0]
+    smp = np.zeros(len(mesh["tets"]), bool)
+    smp[[first, second][:count]] = True
+    rounded = {"ambiguous_fraction": 0.0, "isolated_fraction": 0.0, "reasons": []}
+    found = verdict(mesh, 0.0, labels={"smp": smp}, threshold_report=rounded)
+    assert (found["verdict"] == "REJECTED") == rejected
+    assert ("isolated" in " ".join(found["reasons"])) == rejected
