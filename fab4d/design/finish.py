@@ -125,7 +125,7 @@ def relaxed_from(carried: Search, settings: ReducedSettings, watch: Watch, itera
     settings = replace(settings, relax_iterations=iterations, nearly=1.0)
     at = Search(carried.equilibria, carried.design, carried.patch_radius, lam_SMP=carried.lam_SMP, exchanges=EXCHANGED)
     watch("carried over", at)
-    return relaxed_clear(_relaxed_further(at, settings, watch), settings, watch)
+    return relaxed_clear(relaxed_further(at, settings, watch), settings, watch)
 
 
 def relaxed_clear(at: Search, settings: ReducedSettings, watch: Watch) -> Relaxed:
@@ -138,11 +138,12 @@ def relaxed_clear(at: Search, settings: ReducedSettings, watch: Watch) -> Relaxe
         settings = replace(settings, weights=kept_clear(settings.weights))
     clear = ratio < LEAST_STABLE
     if clear:
-        at = _relaxed_further(replace(at, phase=Phase.RELAX, iteration=0, slow=0), settings, watch)
+        at = relaxed_further(replace(at, phase=Phase.RELAX, iteration=0, slow=0), settings, watch)
     return Relaxed(at, settings, clear)
 
 
-def _relaxed_further(at: Search, settings: ReducedSettings, watch: Watch) -> Search:
+def relaxed_further(at: Search, settings: ReducedSettings, watch: Watch) -> Search:
+    """The same after the phase of relaxing."""
     L = smoothness_matrix(at.equilibria.problem)
     while at.phase is Phase.RELAX:
         at = STEPS[Phase.RELAX](replace(at, accepted=True), settings, L)

@@ -1,6 +1,6 @@
 """Ways from a relaxed design to labels that can be printed, each in equilibrium."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,34 +69,51 @@ def ways_to_print(
     if design is not None:
         yield Way(design, design)
         return
-    before, found = carried(equilibria, relaxed, relaxed["rho"]), list[Way]()
+    before = carried(equilibria, relaxed, relaxed["rho"])
     if before is None:
         x, forces = relaxed["x"] / problem.length, relaxed["patch_force"] / problem.force
         design = loaded_from_rest(equilibria, rho, x, forces)
         yield Way(design, design)
         return
 
-    def error_of(way: Way) -> float:
-        return rms_of(equilibria, way.fitted)
-
     relaxed_rms = float(relaxed["relaxed_rms"]) / problem.length
     hopeless = min(relaxed_rms, rms_of(equilibria, before)) > OUT_OF_REACH * settings.tolerance
     ways = _mended_ways(equilibria, before, smp, weights, settings)
-    for followed in ways:
-        found += [] if followed is None else [followed]
-        if hopeless or min(map(error_of, found), default=np.inf) <= WITHIN_REACH * settings.target_rms:
-            break
+    found = _followed_until(np.inf if hopeless else WITHIN_REACH * settings.target_rms, ways, equilibria)
     if not found and not hopeless:
         followed = _followed(equilibria, before, smp, weights, patient=True)
         found = [] if followed is None else [followed]
     if not found:
         design = loaded_from_rest(equilibria, rho, before.median.x, before.median.forces)
         found = [Way(design, design)]
-    first = min(found, key=error_of)
+    first = _best_of(found, equilibria)
     yield first
     if problem.n_tets <= FEW_TETS and not hopeless:
         yield from (each for each in found if each is not first)
         yield from (each for each in ways if each is not None)
+
+
+def way_near(
+    equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights, settings: FlipSettings
+) -> Way | None:
+    """The best way found from a near 0/1 design to printable labels like smp (m,), its repair; None where none is."""
+    ways = _mended_ways(equilibria, before, smp, weights, settings)
+    found = _followed_until(WITHIN_REACH * settings.target_rms, ways, equilibria)
+    return _best_of(found, equilibria) if found else None
+
+
+def _followed_until(enough: float, ways: Iterable[Way | None], equilibria: Equilibria) -> list[Way]:
+    """Ways up to the first with an RMS error, L0, of `enough`, or all."""
+    found = list[Way]()
+    for followed in ways:
+        found += [] if followed is None else [followed]
+        if min((rms_of(equilibria, way.fitted) for way in found), default=np.inf) <= enough:
+            break
+    return found
+
+
+def _best_of(found: list[Way], equilibria: Equilibria) -> Way:
+    return min(found, key=lambda way: rms_of(equilibria, way.fitted))
 
 
 def _mended_ways(

@@ -27,6 +27,7 @@ from fab4d.stages._element import Elements, element_of, elements_for
 from fab4d.stages._fit import Fit, Polish, not_reached, other_fit, reachable_fit
 from fab4d.stages._flips import FEW_ROUNDS, fit_flips
 from fab4d.stages._limits import limit_reasons
+from fab4d.stages._renewed import renewed
 from fab4d.stages._ways import Way, loaded_from_rest, rms_of, ways_to_print
 from fab4d.stages.monitor import Monitor
 
@@ -110,12 +111,14 @@ def _fitted(
     design = _best_flipped(equilibria, begin, polish, settings, trace)
     if not equilibria.patches.count:
         return Fit(equilibria, design)
+    radius = float(relaxed["patch_radius"]) / problem.length
+    if not flips_last:
+        design = renewed(equilibria, design, radius, weights, settings, polish, trace)
     if problem is not rounding:
         carried = _in_elements_of(problem, Search(equilibria, design))
         trace.add("carried over", carried)
         polish = _polish(weights, replace(settings, target_rms=weights.error_scale, rounds=FEW_ROUNDS), trace)
         equilibria, design = carried.equilibria, polish(carried.equilibria, carried.design)
-    radius = float(relaxed["patch_radius"]) / problem.length
     fit = reachable_fit(equilibria, design, weights, radius, polish, trace)
     if flips_last and fit.rms > weights.error_scale:
         weights = free

@@ -84,6 +84,7 @@ def test_what_is_too_large_to_round_in_quadratic_elements_is_fitted_in_them(
 
     monkeypatch.setattr(refit, "polish_labels", spy)
     monkeypatch.setattr(_ways, "FEW_TETS", 0)
+    monkeypatch.setattr(refit, "renewed", lambda _, design, *__: design)
     monkeypatch.setattr(_element, "MOST_ROUNDED_DOFS", 0)
     found = refit.run(inputs, PROFILE | {"solver": SolverSettings(element="auto")}, SilentMonitor())
     (first, target, many), *others = targets
@@ -360,6 +361,7 @@ def test_labels_are_flipped_down_to_a_share_above_the_relaxed_error(
     """With little patience below 0.15 of the tolerance, and below the tolerance where there are many unknowns."""
     monkeypatch.setattr(_flips, "MANY_DOFS", most)
     monkeypatch.setattr(_ways, "FEW_TETS", 0)
+    monkeypatch.setattr(refit, "renewed", lambda _, design, *__: design)
     targets = []
 
     def spy(equilibria: Equilibria, design: Design, weights: Any, settings: FlipSettings, watch: Any) -> Design:  # noqa: ARG001

@@ -1,0 +1,106 @@
+"""Printed labels that are relaxed and rounded anew."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from designed_bar import PROFILE, Artifacts, designed_bar, fit_of, rms
+
+from fab4d.design.equilibria import Equilibria
+from fab4d.design.gauss_newton import Design
+from fab4d.design.reduced import refit
+from fab4d.stages import _renewed, _ways
+from fab4d.stages.threshold import labels_for
+
+
+@pytest.fixture(scope="module")
+def inputs() -> Artifacts:
+    return designed_bar()
+
+
+def printed_design(inputs: Artifacts) -> Design:
+    """The repaired labels, before any flips make up for what the repair costs."""
+    equilibria, weights, _ = fit_of(inputs)
+    design = _ways.carried(equilibria, inputs["relaxed"], inputs["rounded"]["smp"].astype(np.float64))
+    assert design is not None
+    return refit(equilibria, design, weights, lambda _: None)
+
+
+def renewed(inputs: Artifacts, design: Design, polish: Any = None, **changes: Any) -> tuple[Design, list[str]]:
+    """The design that is found, and the phases that were shown.
+
+    changes : of the settings of flips
+    """
+    equilibria, weights, settings = fit_of(inputs)
+    phases = list[str]()
+    trace: Any = SimpleNamespace(add=lambda phase, _: phases.append(phase))
+    radius = float(inputs["relaxed"]["patch_radius"]) / equilibria.problem.length
+    wanted = replace(settings, **({"low_rms": 0.0, "tolerance": np.inf} | changes))
+    keep = polish or (lambda _, each: each)
+    return _renewed.renewed(equilibria, design, radius, weights, wanted, keep, trace), phases
+
+
+def test_labels_rounded_anew_leave_less_of_the_error_and_can_be_printed(inputs: Artifacts) -> None:
+    before = printed_design(inputs)
+    problem = fit_of(inputs)[0].problem
+    after, phases = renewed(inputs, before, target_rms=0.0)
+    assert {"relax", "round", "printed"} <= set(phases)
+    assert rms(problem, after) < 0.95 * rms(problem, before)
+    X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
+    smp = after.rho > 0.5
+    assert set(np.unique(after.rho)) <= {0.0, 1.0}
+    again = labels_for(X, tets, after.rho, np.ones(len(tets)), PROFILE["printer"])
+    np.testing.assert_array_equal(again.smp, smp)
+    equilibria, weights, _ = fit_of(inputs)
+    fitted = refit(equilibria, after, weights, lambda _: None)
+    assert rms(problem, fitted) == pytest.approx(rms(problem, after), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "share"), [("target_rms", 1.01), ("low_rms", 1.01), ("tolerance", 0.99 / _renewed.OUT_OF_REACH)]
+)
+def test_what_needs_no_better_labels_or_is_out_of_reach_keeps_its_own(
+    inputs: Artifacts, name: str, share: float
+) -> None:
+    """share : of the error of the design"""
+    before = printed_design(inputs)
+    error = rms(fit_of(inputs)[0].problem, before)
+    assert renewed(inputs, before, **({"target_rms": 0.0} | {name: share * error})) == (before, [])
+
+
+def test_many_unknowns_keep_their_labels(inputs: Artifacts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_renewed, "MANY_DOFS", 3 * fit_of(inputs)[0].problem.n_nodes - 1)
+    before = printed_design(inputs)
+    assert renewed(inputs, before, target_rms=0.0) == (before, [])
+
+
+@pytest.mark.parametrize("worse", ["error", "share of SMP"])
+def test_other_labels_that_are_no_better_are_not_taken(inputs: Artifacts, worse: str) -> None:
+    """Each of the shares begins with the labels to begin with then."""
+    before, polished = printed_design(inputs), list[Design]()
+    problem = fit_of(inputs)[0].problem
+
+    def polish(_: Equilibria, design: Design) -> Design:
+        polished.append(design)
+        if worse == "error":
+            y = problem.X_temp + 2.0 * (before.final.y - problem.X_temp)
+        else:
+            y = problem.X_temp + 0.5 * (before.final.y - problem.X_temp)
+        return replace(design, rho=np.ones_like(design.rho), final=replace(design.final, y=y))
+
+    most = 1.0 if worse == "error" else 0.99
+    assert renewed(inputs, before, polish, target_rms=0.0, max_smp_fraction=most)[0] is before
+    assert len(polished) == len(_renewed.SHARES)
+
+
+def test_labels_without_equilibria_on_the_way_keep_their_own(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = printed_design(inputs)
+    with monkeypatch.context() as patch:
+        patch.setattr(_renewed, "rounded_on", lambda *_: None)
+        assert renewed(inputs, before, target_rms=0.0)[0] is before
+    monkeypatch.setattr(_renewed, "way_near", lambda *_: None)
+    assert renewed(inputs, before, target_rms=0.0)[0] is before
