@@ -133,7 +133,7 @@ def relaxed_clear(at: Search, settings: ReducedSettings, watch: Watch) -> Relaxe
 
     Where it is not far from them, rounding keeps clear of them.
     """
-    ratio = _least_ratio(at)
+    ratio = least_ratio(at.equilibria, at.design)
     if ratio < SOFT:
         settings = replace(settings, weights=kept_clear(settings.weights))
     clear = ratio < LEAST_STABLE
@@ -182,9 +182,9 @@ def kept_clear(weights: ObjectiveWeights) -> ObjectiveWeights:
     return weights.replace(least_stable=LEAST_STABLE, lam_stable=LAM_STABLE)
 
 
-def _least_ratio(at: Search) -> float:
-    """Of the modes of the median shape; inf where none is found."""
-    return float(soft_modes(at.equilibria, at.design.rho, at.design.median).ratios.min(initial=np.inf))
+def least_ratio(equilibria: Equilibria, design: Design) -> float:
+    """The least share of its stiffness that a mode of the median shape keeps; inf where no soft mode is found."""
+    return float(soft_modes(equilibria, design.rho, design.median).ratios.min(initial=np.inf))
 
 
 def _is_hard(after: Search) -> bool:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from fab4d.design.equilibria import Equilibria
-from fab4d.design.finish import ANY_SHARE, relaxed_clear, relaxed_further, rounded_on
+from fab4d.design.finish import ANY_SHARE, LEAST_STABLE, least_ratio, relaxed_clear, relaxed_further, rounded_on
 from fab4d.design.flips import FlipSettings
 from fab4d.design.gauss_newton import Design
 from fab4d.design.objective import ObjectiveWeights
@@ -19,7 +19,7 @@ from fab4d.stages._ways import Way, rms_of, way_near
 RELAX_ITERATIONS = 4
 # Labels are rounded anew with an error that counts 1 at these shares of what the printed ones leave, one after the
 # other: which of them leads to better ones is chance.
-SHARES = (0.7, 0.5)
+SHARES = (1.0, 0.5)
 
 
 def renewed(
@@ -50,9 +50,17 @@ def renewed(
             continue
         trace.add("printed", replace(at, design=way.fitted))
         other = polish(equilibria, way.fitted)
-        allowed = float(problem.volume_fractions @ other.rho) <= settings.max_smp_fraction
-        design = other if allowed and rms_of(equilibria, other) < rms else design
+        if rms_of(equilibria, other) < rms and _as_sound(equilibria, other, design, settings):
+            design = other
     return design
+
+
+def _as_sound(equilibria: Equilibria, other: Design, design: Design, settings: FlipSettings) -> bool:
+    """Whether `other` keeps the goal's share of SMP, and is no nearer to unstable states than `design` or is clear."""
+    if float(equilibria.problem.volume_fractions @ other.rho) > settings.max_smp_fraction:
+        return False
+    least = min(least_ratio(equilibria, design), LEAST_STABLE)
+    return least_ratio(equilibria, other) >= least
 
 
 def _rounded_anew(at: Search, weights: ObjectiveWeights, settings: FlipSettings, trace: Trace) -> Search | None:

@@ -97,8 +97,7 @@ def way_near(
     equilibria: Equilibria, before: Design, smp: BoolArray, weights: ObjectiveWeights, settings: FlipSettings
 ) -> Way | None:
     """The best way found from a near 0/1 design to printable labels like smp (m,), its repair; None where none is."""
-    ways = _mended_ways(equilibria, before, smp, weights, settings)
-    found = _followed_until(WITHIN_REACH * settings.target_rms, ways, equilibria)
+    found = [way for way in _mended_ways(equilibria, before, smp, weights, settings) if way is not None]
     return _best_of(found, equilibria) if found else None
 
 

@@ -218,7 +218,7 @@ def test_relaxing_goes_on_clear_of_unstable_states_where_it_comes_near_them(
         return replace(at, phase=Phase.ROUND if at.phase is Phase.RELAX else Phase.DONE, iteration=7)
 
     monkeypatch.setattr(finish, "STEPS", {Phase.RELAX: step, Phase.ROUND: step})
-    monkeypatch.setattr(finish, "_least_ratio", lambda _: ratio)
+    monkeypatch.setattr(finish, "least_ratio", lambda *_: ratio)
     monkeypatch.setattr(finish, "decided_by_and_by", lambda *_: None)
     carried = carried_in(quadratic, found)
     assert carried is not None
@@ -243,7 +243,7 @@ def test_clear_of_unstable_states_all_tets_are_decided_by_and_by_at_once(
         return real(at, settings, watch)
 
     monkeypatch.setattr(finish, "decided_by_and_by", watched)
-    monkeypatch.setattr(finish, "_least_ratio", lambda _: 0.1)
+    monkeypatch.setattr(finish, "least_ratio", lambda *_: 0.1)
     how = replace(FINER_MESH, relax_iterations=relaxing, most_left=0.05)
     at = rounded_from(carried, settings_for(quadratic), lambda phase, _: phases.append(phase), how)
     assert len(shares) == 1

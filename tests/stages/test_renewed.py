@@ -76,9 +76,14 @@ def test_many_unknowns_keep_their_labels(inputs: Artifacts, monkeypatch: pytest.
     assert renewed(inputs, before, target_rms=0.0) == (before, [])
 
 
-@pytest.mark.parametrize("worse", ["error", "share of SMP"])
-def test_other_labels_that_are_no_better_are_not_taken(inputs: Artifacts, worse: str) -> None:
-    """Each of the shares begins with the labels to begin with then."""
+@pytest.mark.parametrize(
+    ("worse", "ratio", "taken"),
+    [("error", 0.3, False), ("share of SMP", 0.3, False), ("", 0.3, True), ("", 0.21, True), ("", 0.19, False)],
+)
+def test_other_labels_that_are_no_better_are_not_taken(
+    inputs: Artifacts, monkeypatch: pytest.MonkeyPatch, worse: str, ratio: float, taken: bool
+) -> None:
+    """ratio : of the stiffness of the softest mode, of which the design to begin with keeps 0.4"""
     before, polished = printed_design(inputs), list[Design]()
     problem = fit_of(inputs)[0].problem
 
@@ -90,9 +95,12 @@ def test_other_labels_that_are_no_better_are_not_taken(inputs: Artifacts, worse:
             y = problem.X_temp + 0.5 * (before.final.y - problem.X_temp)
         return replace(design, rho=np.ones_like(design.rho), final=replace(design.final, y=y))
 
-    most = 1.0 if worse == "error" else 0.99
-    assert renewed(inputs, before, polish, target_rms=0.0, max_smp_fraction=most)[0] is before
-    assert len(polished) == len(_renewed.SHARES)
+    monkeypatch.setattr(_renewed, "least_ratio", lambda _, design: 0.4 if design is before else ratio)
+    monkeypatch.setattr(_renewed, "SHARES", (1.0,))
+    most = 0.99 if worse == "share of SMP" else 1.0
+    found = renewed(inputs, before, polish, target_rms=0.0, max_smp_fraction=most)[0]
+    assert len(polished) == 1
+    assert (found is not before) == taken
 
 
 def test_labels_without_equilibria_on_the_way_keep_their_own(
