@@ -10,7 +10,7 @@ from designed_bar import PROFILE, Artifacts, designed_bar, fit_of, rms
 
 from fab4d.design.equilibria import Equilibria
 from fab4d.design.gauss_newton import Design
-from fab4d.design.reduced import refit
+from fab4d.design.reduced import polished, refit
 from fab4d.stages import _renewed, _ways
 from fab4d.stages.threshold import labels_for
 
@@ -21,9 +21,9 @@ def inputs() -> Artifacts:
 
 
 def printed_design(inputs: Artifacts) -> Design:
-    """The repaired labels, before any flips make up for what the repair costs."""
+    """Labels that leave much of the error on any processor: TPE alone, which springs back."""
     equilibria, weights, _ = fit_of(inputs)
-    design = _ways.carried(equilibria, inputs["relaxed"], inputs["rounded"]["smp"].astype(np.float64))
+    design = _ways.carried(equilibria, inputs["relaxed"], np.zeros(equilibria.problem.n_tets))
     assert design is not None
     return refit(equilibria, design, weights, lambda _: None)
 
@@ -47,15 +47,15 @@ def test_labels_rounded_anew_leave_less_of_the_error_and_can_be_printed(inputs: 
     problem = fit_of(inputs)[0].problem
     after, phases = renewed(inputs, before, target_rms=0.0)
     assert {"relax", "round", "printed"} <= set(phases)
-    assert rms(problem, after) < 0.95 * rms(problem, before)
+    assert rms(problem, after) < 0.5 * rms(problem, before)
     X, tets = inputs["mesh"]["X"], inputs["mesh"]["tets"]
     smp = after.rho > 0.5
     assert set(np.unique(after.rho)) <= {0.0, 1.0}
     again = labels_for(X, tets, after.rho, np.ones(len(tets)), PROFILE["printer"])
     np.testing.assert_array_equal(again.smp, smp)
-    equilibria, weights, _ = fit_of(inputs)
-    fitted = refit(equilibria, after, weights, lambda _: None)
-    assert rms(problem, fitted) == pytest.approx(rms(problem, after), rel=0.1)
+    exact = polished(fit_of(inputs)[0], after)
+    np.testing.assert_allclose(exact.median.x, after.median.x, atol=1e-5)
+    np.testing.assert_allclose(exact.final.y, after.final.y, atol=1e-5)
 
 
 @pytest.mark.parametrize(
